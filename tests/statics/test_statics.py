@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import udkjax as udk
+from tests.calls import calls_of
 from tests.choices import fast
 from udkjax.positions.following.curve import NumpyCurve
 from udkjax.statics import linearization
@@ -70,21 +71,19 @@ def _without_basis(found):
     return *matrices, N @ np.asarray(found.force), found.loads, found.multipliers
 
 
-def test_rest_of_concrete_numbers_is_found_without_a_trace(monkeypatch):
+def test_rest_of_concrete_numbers_is_found_without_a_trace():
     """A trace takes a second in a chain of a hundred links, as long as all of the search."""
-    traced = []
-    monkeypatch.setattr(linearization, "linearize", lambda *given: traced.append(given))
-    assert bool(udk.equilibrium(udk.library.chain(3, angle=0.1)).stable) and not traced
+    with calls_of(linearization.linearize) as traced:
+        assert bool(udk.equilibrium(udk.library.chain(3, angle=0.1)).stable) and not traced
 
 
-def test_no_step_is_tried_from_a_position_of_rest(monkeypatch):
-    mech, tried = udk.library.parallelogram(-1.3), []
+def test_no_step_is_tried_from_a_position_of_rest():
+    mech = udk.library.parallelogram(-1.3)
     rest = udk.equilibrium(mech)
-    correct = NumpyCurve.correct
-    monkeypatch.setattr(NumpyCurve, "correct", lambda *given, **choices: tried.append(1) or correct(*given, **choices))
-    again = udk.equilibrium(mech, rest.state)
-    assert not tried and bool(again.balanced)
-    assert bool(udk.equilibrium(mech).balanced) and tried
+    with calls_of(NumpyCurve.correct) as tried:
+        again = udk.equilibrium(mech, rest.state)
+        assert not tried and bool(again.balanced)
+        assert bool(udk.equilibrium(mech).balanced) and tried
 
 
 def test_the_papers_linkage_standing_is_unstable():
@@ -288,11 +287,25 @@ def test_a_batch_of_equilibria_has_a_code_for_each_member():
     assert float(np.mean(found.balanced)) > 0.9
 
 
-def test_a_long_chain_comes_to_rest_in_a_few_steps(monkeypatch):
+@pytest.mark.parametrize("by", [lambda f: f, pytest.param(jax.jit, marks=pytest.mark.slow)], ids=["numpy", "jax"])
+@pytest.mark.parametrize("stiffness", [10.0, 50.0])
+def test_where_unbalanced_loads_have_a_minimum_the_search_goes_on_downhill(by, stiffness):
+    """There they do not vanish, and no step of Newton's method reduces them: at the inflections of the potential energy."""
+    bare = udk.library.four_bar()
+    spring = udk.TorsionSpring(["ground", "crank"], stiffness)
+    mech = udk.Mechanism(bare.bodies, bare.joints, forces={"spring": spring})
+    analysis = udk.analyse(mech)
+    rest = by(lambda k: udk.equilibrium(mech.with_parameters({"force.spring.stiffness": k}), analysis=analysis))(stiffness)
+    assert rest.stable
+    turned = udk.kinematics(mech, "body.crank.angle", float(rest.q[0, 2]) + np.array([-1e-3, 0.0, 1e-3]))
+    low, least, high = np.asarray(udk.energy(mech, turned).potential)
+    assert abs(high - low) < 1e-6 * (high + low - 2 * least) / 1e-3  # the minimum is in the middle
+
+
+def test_a_long_chain_comes_to_rest_in_a_few_steps():
     """Its end moves by many lengths of a link while all links turn by 0.1 rad."""
-    positions, linearize = [], NumpyLinearizer.linearize
-    monkeypatch.setattr(NumpyLinearizer, "linearize", lambda self, t, q: positions.append(q) or linearize(self, t, q))
-    found = udk.equilibrium(udk.library.chain(30, angle=0.1))
+    with calls_of(NumpyLinearizer.linearize) as positions:
+        found = udk.equilibrium(udk.library.chain(30, angle=0.1))
     assert found.stable
     assert len(positions) < 10
 

@@ -42,7 +42,8 @@ SMALLEST_STIFFNESS = 1e-12  # relative to the scale of stiffnesses: smaller valu
 # The fraction of a step, the number of trials, whether the last was better, its q and the linearization at q.
 Trial: TypeAlias = tuple[Array, Array, Array, Array, Linearization]
 IsTrue: TypeAlias = Bool[Array, ""]  # named, since annotations of inner functions are evaluated at each call
-Settling: TypeAlias = tuple[Array, Linearization, Array, Array]  # q, the linearization at q, steps, whether the last was better
+# q, the linearization at q, the number of steps, whether the last was better, whether steps go downhill.
+Settling: TypeAlias = tuple[Array, Linearization, Array, Array, Array]
 REST = "an equilibrium needs positions that the constraints determine"
 
 
@@ -133,8 +134,9 @@ def equilibrium(
     the mechanism rests in all positions around as well: by statics alone, whatever its masses. `holding_efforts` has the bounds.
 
     Newton's method with K = -F_q + (lambda^T Psi)_qq; steps are limited in length, and halved until the unbalanced loads
-    decrease. Pure, jittable and batched by `vmap` (`balanced` marks the members at rest); differentiable with respect to
-    every number of the mechanism, where the stiffness is not singular.
+    decrease. Where no step decreases them, the search goes on downhill, to a stable equilibrium. Pure, jittable and batched by
+    `vmap` (`balanced` marks the members at rest); differentiable with respect to every number of the mechanism, where the
+    stiffness is not singular.
 
     Args:
         mechanism: its drivers hold the values of time t.
@@ -250,24 +252,25 @@ def _equilibrium(
 def _settle(
     curve: AbstractCurve, near: Linearizer, t: Float[Array, ""], q: Float[Array, "n"], free: int, stable: bool
 ) -> Float[Array, "n"]:
-    """Take Newton steps until a step no longer improves the position."""
+    """Take Newton steps until a step no longer improves the position.
+
+    Unbalanced loads may have a minimum where they do not vanish: from there, steps go downhill.
+    """
     if not free:
         return q
     by, xp, scale = curve.by, curve.by.xp, near.scale(t, q)
     units = _step_units(curve.units[:-1], q, xp)
 
-    def length(force: Float[Array, "f"]) -> Float[Array, ""]:
-        return xp.sqrt(force @ force)  # in a third of the time of a norm
-
     def is_unsettled(state: Settling) -> IsTrue:
-        _, current, k, better = state
-        return better & (k < MOST_NEWTON_STEPS) & (length(current.force) > FORCE_ROUNDING * scale.force)
+        _, current, k, better, _ = state
+        return better & (k < MOST_NEWTON_STEPS) & (_length(current.force, xp) > FORCE_ROUNDING * scale.force)
 
     def body(state: Settling) -> Settling:
-        q, current, k, _ = state
-        step = current.directions @ _towards_rest(current, scale, stable, curve)
+        q, current, k, _, downhill = state
+        newton, descent = (lambda goal=goal: _towards_rest(current, scale, goal, curve) for goal in (False, True))
+        step = current.directions @ (descent() if stable else by.cond(downhill, descent, newton))
         step = step * CLOSURE.shortening(abs(step / units).max(), xp)
-        size = length(current.force)
+        size = _length(current.force, xp)
 
         def trial(state: Trial) -> Trial:
             share, j, *_ = state
@@ -276,7 +279,7 @@ def _settle(
             trial = near.linearize(t, new)
             # A position is better if the loads do work (by the trapezoidal rule), or the unbalanced loads decrease.
             work = 0.5 * (current.loads + trial.loads) @ (new - q)
-            better = (work > 0 if stable else False) | (length(trial.force) < size)
+            better = (downhill & (work > 0)) | (_length(trial.force, xp) < size)
             return 0.5 * share, j + 1, closed & better, new, trial
 
         def worse(state: Trial) -> IsTrue:
@@ -285,10 +288,15 @@ def _settle(
         first = xp.ones(()), xp.asarray(0), xp.asarray(False), q, current
         _, _, better, new, following = by.while_loop(worse, trial, first)
         new, following = by.cond(better, lambda: (new, following), lambda: (q, current))
-        return new, following, k + 1, better
+        is_stuck = ~better & ~downhill & (size > FORCE_TOL * scale.force)
+        return new, following, k + 1, better | is_stuck, downhill | is_stuck
 
-    start = q, near.linearize(t, q), xp.asarray(0), xp.asarray(True)
+    start = q, near.linearize(t, q), xp.asarray(0), xp.asarray(True), xp.asarray(stable)
     return by.while_loop(is_unsettled, body, start)[0]
+
+
+def _length(force: Float[Array, "f"], xp: ArrayLibrary) -> Float[Array, ""]:
+    return xp.sqrt(force @ force)  # in a third of the time of a norm
 
 
 def _step_units(units: Float[Array, "n"], q: Float[Array, "n"], xp: ArrayLibrary) -> Float[Array, "n"]:
