@@ -64,7 +64,7 @@ def deferred(function: Callable[Arguments, Result], keeps_concrete: bool = False
         if jax.config.jax_disable_jit:
             return function(*args, **kwargs)
         leaves = jax.tree.leaves((args, kwargs))
-        if any(map(varies, filter(_is_traced, leaves))):  # within `shard_map`, which the types of its values show
+        if any(varies(x) for x in leaves if isinstance(x, Tracer)):  # within `shard_map`, which the types of its values show
             return by_jit(*args, **kwargs)
         try:
             program, leaves, out = trace_once(function, args, kwargs)

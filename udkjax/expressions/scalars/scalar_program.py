@@ -234,9 +234,10 @@ def _evaluate(node: Node, values: list[Operand]) -> Operand:
 
 def _function_of_floats(node: Node) -> Callable:
     """Return the function that computes a node on Python floats; chosen once, because many programs run thousands of times."""
-    constant = node.detail if node.kind == "constant" else None
-    if constant is not None and type(constant) in (float, int, bool) and math.isfinite(constant):
-        return written_as(repr(constant), lambda: constant)
+    if node.kind == "constant":
+        constant = node.detail
+        is_number = type(constant) in (float, int, bool) and math.isfinite(constant)
+        return written_as(repr(constant), lambda: constant) if is_number else lambda: constant
     if node.kind == "apply" and node.detail.primitive.name == "select_n" and len(node.arguments) == 3:
         return _SELECT_OF_TWO
     return _plain_function(node, math, _NUMBER_FUNCTIONS) or (lambda *values: _evaluate(node, list(values)))
