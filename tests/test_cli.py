@@ -11,6 +11,7 @@ import pytest
 import xarray
 
 import udkjax as udk
+from tests.calls import calls_of
 from tests.command_line import udkjax
 from tests.fresh_process import python
 from udkjax.cli import COMMANDS
@@ -165,10 +166,11 @@ def test_wrong_input_is_refused_by_name(tmp_path, monkeypatch, capsys, arguments
 )
 def test_a_file_of_no_known_kind_is_refused_before_anything_runs(tmp_path, monkeypatch, capsys, command):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("udkjax.load", lambda _: pytest.fail("it ran"))
-    for name in ("run.xls", "run"):
-        assert udkjax(*command, "--out", name) == 2
-        assert f"--out {name} must end with one of .nc, .h5, .csv, .npz" in capsys.readouterr().err
+    with calls_of(udk.load) as loaded:
+        for name in ("run.xls", "run"):
+            assert udkjax(*command, "--out", name) == 2
+            assert f"--out {name} must end with one of .nc, .h5, .csv, .npz" in capsys.readouterr().err
+    assert loaded == []
     assert list(tmp_path.iterdir()) == []
 
 

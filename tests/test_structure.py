@@ -81,3 +81,45 @@ def test_each_name_of_a_class_is_used_once():
             if isinstance(node, ast.ClassDef):
                 places.setdefault(node.name, []).append(module)
     assert {name: found for name, found in places.items() if len(found) > 1} == {}
+
+
+# Tests that replace names of the package depend on its implementation: `calls_of` (calls.py) observes calls, `multiplied`
+# (ten_times.py) changes constants, and arguments do the rest. This ceiling may only fall.
+MOST_PATCHES = 84
+PATCHES = "setattr", "delattr", "setitem", "delitem"
+
+
+def patches(text: str) -> int:
+    """Return how many patches of a test replace names of the project, not those of other libraries."""
+    tree, others = ast.parse(text), set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            others |= {(x.asname or x.name).split(".")[0] for x in node.names if x.name.split(".")[0] != "udkjax"}
+        elif isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] != "udkjax":
+            others |= {x.asname or x.name for x in node.names}
+    calls = [
+        n for n in ast.walk(tree) if isinstance(n, ast.Call) and isinstance(n.func, ast.Attribute) and n.func.attr in PATCHES
+    ]
+    targets = [ast.unparse(n.args[0]) for n in calls if "patch" in ast.unparse(n.func)]  # pyright: ignore
+    return sum("udkjax" in x or ("'" not in x and x.split(".")[0].split("[")[0] not in others) for x in targets)
+
+
+def test_patches_of_the_projects_names_are_found():
+    text = """
+import os, udkjax as udk
+from pathlib import Path
+from udkjax.native import primitive
+monkeypatch.setattr(os, "replace", None)
+monkeypatch.setattr("pathlib.Path.replace", None)
+monkeypatch.setattr(Path.home, "x", None)
+monkeypatch.setattr(udk, "load", None)
+monkeypatch.delattr(primitive.PreparedCall, "__call__")
+patched.setattr("udkjax.show.doctor.facts", None)
+setattr(primitive, "load", None)
+"""
+    assert patches(text) == 3
+
+
+def test_few_tests_replace_names_of_the_project():
+    found = {file.name: patches(file.read_text(encoding="utf-8")) for file in Path(__file__).parent.rglob("*.py")}
+    assert sum(found.values()) <= MOST_PATCHES, {name: count for name, count in found.items() if count}

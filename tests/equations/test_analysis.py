@@ -2,7 +2,6 @@
 
 import subprocess
 import sys
-from typing import Any
 
 import jax
 import numpy as np
@@ -10,6 +9,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax as udk
+from tests.calls import calls_of
 from tests.choices import fast
 from udkjax.equations.programs import scales
 from udkjax.equations.programs.scene_arrays import SceneArrays
@@ -50,14 +50,15 @@ def test_what_the_rows_are_measured_by():
     assert len(names) == len(gear.rows)
 
 
-def test_masses_and_loads_decide_nothing_about_rows(monkeypatch):
+def test_masses_and_loads_decide_nothing_about_rows():
     """Mechanisms that differ only in masses and loads share the result."""
     mechanism = udk.library.parallelogram(-0.6)
     udk.analyse(mechanism)
-    monkeypatch.setattr("udkjax.equations.rows.analysis.examine_rows", None)
-    for name in ("body.coupler.mass", "body.link1.inertia", "gravity"):
-        changed = mechanism.with_parameters({name: 2.0 * mechanism.parameters()[name]})
-        assert udk.analyse(changed).redundant_rows == udk.analyse(mechanism).redundant_rows
+    with calls_of(redundancy.examine_rows) as examined:
+        for name in ("body.coupler.mass", "body.link1.inertia", "gravity"):
+            changed = mechanism.with_parameters({name: 2.0 * mechanism.parameters()[name]})
+            assert udk.analyse(changed).redundant_rows == udk.analyse(mechanism).redundant_rows
+    assert examined == []
 
 
 def test_a_traced_mechanism_has_the_rows_of_the_concrete_one_that_it_was_made_from_and_scales_of_its_own():
@@ -153,34 +154,26 @@ def row_of_cranks(count, speed, contradicted=False):
 
 
 @pytest.mark.parametrize("large", [False, True])
-def test_what_drivers_cannot_reach_is_given_up_soon(monkeypatch, large):
+def test_what_drivers_cannot_reach_is_given_up_soon(large):
     """The redundant rows are the same whether or not a driver reaches its values; contradictory drivers give None."""
-    choose, solved = redundancy.kinematic_rows, []
-
-    def counted(mechanism):
-        rows: Any = choose(mechanism, large)
-        correction = rows.correction
-        rows.correction = lambda t, q: solved.append(t) or correction(t, q)
-        return rows
-
-    monkeypatch.setattr(redundancy, "kinematic_rows", counted)
+    correction = type(redundancy.kinematic_rows(row_of_cranks(4, 1.0), large)).correction
     for speed, steps in ((1.0, 80), (100.0, 120), (-0.01, 120)):
-        found = redundancy.redundant_rows(row_of_cranks(4, speed))
-        assert found == (8, 9) and len(solved) < steps, len(solved)
-        solved.clear()
-    assert redundancy.redundant_rows(row_of_cranks(4, 1.0, contradicted=True)) is None
+        with calls_of(correction) as solved:
+            assert redundancy.redundant_rows(row_of_cranks(4, speed), large) == (8, 9)
+        assert 0 < len(solved) < steps, len(solved)
+    with calls_of(correction) as solved:
+        assert redundancy.redundant_rows(row_of_cranks(4, 1.0, contradicted=True), large) is None
     assert len(solved) < 400
 
 
-def test_a_closure_computes_psi_once_at_each_position(monkeypatch):
-    mechanism, seen = row_of_cranks(4, 1.0), []
-    rows, run = redundancy.kinematic_rows(mechanism), SceneArrays._run
+def test_a_closure_computes_psi_once_at_each_position():
+    mechanism = row_of_cranks(4, 1.0)
+    rows = redundancy.kinematic_rows(mechanism)
     start = rows.close(0.0, np.asarray(mechanism.q0, float).ravel())
     assert start is not None
-    monkeypatch.setattr(
-        SceneArrays, "_run", lambda *given, **more: seen.append((given[1], given[3].tobytes())) or run(*given, **more)
-    )
-    closed = rows.close(0.0, start.q + 0.1 * np.random.default_rng(0).standard_normal(start.q.shape))
+    seen: list[tuple[tuple[str, ...], bytes]] = []
+    with calls_of(SceneArrays._run, begins=lambda given: seen.append((given["outputs"], given["q"].tobytes()))):
+        closed = rows.close(0.0, start.q + 0.1 * np.random.default_rng(0).standard_normal(start.q.shape))
     assert closed is not None and len({q for _, q in seen}) > 3
     assert len(set(seen)) == len(seen)
 
@@ -229,10 +222,8 @@ def test_ten_times_more_or_less_of_a_threshold_changes_nothing(monkeypatch, name
         value = getattr(module, name)
         changed = value._replace(**{field: factor * getattr(value, field)}) if field else factor * value
         monkeypatch.setattr(module, name, changed)
-    choose = redundancy.kinematic_rows
-    monkeypatch.setattr(redundancy, "kinematic_rows", lambda mechanism: choose(mechanism, large))
     for kind, mechanism in scenes.items():
-        rows = redundancy.redundant_rows(mechanism)
+        rows = redundancy.redundant_rows(mechanism, large)
         assert rows is not None and len(rows) == len(expected[kind])
         own = scales.concrete_scales(mechanism)
         off = mechanism.q0.ravel() + 1e-3 * own.coordinates(3 * len(mechanism.bodies)) * np.cos(np.arange(mechanism.q0.size))

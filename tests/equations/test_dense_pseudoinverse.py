@@ -1,18 +1,15 @@
-import sys
-
 import jax
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
 import udkjax as udk
+from tests.ten_times import multiplied
 from udkjax.equations.elimination.dense_pseudoinverse import (
-    FEW_ROWS,
     FactoredPseudoinverse,
     TruncatedPseudoinverse,
     dense_pseudoinverse,
 )
-from udkjax.equations.states.state_arrays import StateArrays
 
 TOL = 1e-4
 
@@ -75,11 +72,11 @@ def test_without_numbers_to_factor():
     assert isinstance(dense_pseudoinverse(matrix(40, 50, [1.0] * 30), TOL), FactoredPseudoinverse)
 
 
-def test_equilibrium_of_a_long_chain_is_that_by_singular_values(monkeypatch):
+def test_equilibrium_of_a_long_chain_is_that_by_singular_values():
     chain, found = udk.library.chain(20, angle=0.1), []
-    for few in (10**6, FEW_ROWS):
-        monkeypatch.setattr(sys.modules[FactoredPseudoinverse.__module__], "FEW_ROWS", few)
-        found.append(udk.equilibrium(chain.with_parameters({})))
+    for factor in (10**6, 1):
+        with multiplied(factor, "equations.elimination.dense_pseudoinverse.FEW_ROWS"):
+            found.append(udk.equilibrium(chain.with_parameters({})))
     slow, fast = found
     assert slow.balanced and fast.balanced
     assert_allclose(fast.q, slow.q, atol=1e-12)
@@ -89,13 +86,12 @@ def test_equilibrium_of_a_long_chain_is_that_by_singular_values(monkeypatch):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("build", [lambda: udk.library.chain(14), lambda: udk.library.n_four_bar(6)], ids=["chain", "loops"])
-def test_reactions_of_large_scenes_are_those_by_singular_values(build, monkeypatch):
+def test_reactions_of_large_scenes_are_those_by_singular_values(build):
     mechanism, found = build(), []
     solution = udk.simulate(mechanism, np.linspace(0.0, 0.02, 4))
-    for few in (10**6, FEW_ROWS):
-        monkeypatch.setattr(sys.modules[FactoredPseudoinverse.__module__], "FEW_ROWS", few)
-        monkeypatch.setattr(sys.modules[StateArrays.__module__], "FEW_ROWS", few)
-        found.append(udk.reactions(mechanism, solution))
+    for factor in (10**6, 1):
+        with multiplied(factor, "equations.elimination.dense_pseudoinverse.FEW_ROWS"):
+            found.append(udk.reactions(mechanism, solution))
     slow, fast = map(jax.tree.leaves, found)
     for a, b in zip(slow, fast, strict=True):
         assert_allclose(b, a, rtol=1e-8, atol=1e-9 * np.nanmax(np.abs(a), initial=0.0))

@@ -9,6 +9,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax as udk
+from tests.calls import calls_of
 from tests.elements import BODIES, DRIVERS, FORCES, JOINTS, P
 from tests.run_programs import evaluate_programs
 from udkjax.equations import constraints, loads, prepare
@@ -287,7 +288,7 @@ def test_floats_and_arrays_find_the_same(monkeypatch):
     assert (np.array(by_floats[100:-1]) == by_floats[100]).all()
 
 
-def test_many_states_at_once_are_single_states(monkeypatch):
+def test_many_states_at_once_are_single_states():
     """By loops at first, later by a written function, whose variables have a number for each state."""
     names = ("revolute", "prismatic", "slot", "weld")
     mechanism = udk.Mechanism(BODIES, {name: JOINTS[name] for name in names}, forces={"push": FORCES["push"]})
@@ -302,24 +303,22 @@ def test_many_states_at_once_are_single_states(monkeypatch):
             return np.concatenate([at.psi(t, q), *at.geometry(t, q, v), *at.loads(t, q, v), at.energy(t, q, v)])
 
     single = np.stack([evaluate(t[k], q[:, k], v[:, k]) for k in range(5)], 1)
-    runs, run = [], FloatLoops.of_many
-    monkeypatch.setattr(FloatLoops, "of_many", lambda self, names: runs.append(found := run(self, names)) or found)
-    for _ in range(_WORTH_WRITING + 1):
-        assert_allclose(evaluate(t, q, v), single, rtol=1e-12, atol=1e-12)
+    with calls_of(FloatLoops.of_many) as runs:
+        for _ in range(_WORTH_WRITING + 1):
+            assert_allclose(evaluate(t, q, v), single, rtol=1e-12, atol=1e-12)
     at_rest = at.geometry(t, q, np.zeros((q0.size, 1)))  # the same velocity for all states
     assert_allclose(at_rest[2], at.geometry(t, q, np.zeros_like(q))[2], rtol=0, atol=0)
-    assert runs[0] is None and runs[-1] is not None
+    assert runs[0].result is None and runs[-1].result is not None
     assert np.isnan(single[:, 4]).any() and np.isfinite(single[:, :4]).all()
 
 
-def test_one_position_is_evaluated_once(monkeypatch):
-    runs, run = [], SceneArrays._run
-    monkeypatch.setattr(SceneArrays, "_run", lambda self, outputs, *state: runs.append(outputs) or run(self, outputs, *state))
+def test_one_position_is_evaluated_once():
     mechanism = udk.library.four_bar()
     terms, q = DenseTerms(mechanism), np.array(mechanism.q0).ravel()
-    slopes, psi = terms.slopes(0.0, q)[0], terms.psi(0.0, q)
-    assert_allclose(terms.slopes(0.0, q + 0.0)[0], slopes)
-    assert runs == [("psi_q", "psi", "psi_dot")]
+    with calls_of(SceneArrays._run) as runs:
+        slopes, psi = terms.slopes(0.0, q)[0], terms.psi(0.0, q)
+        assert_allclose(terms.slopes(0.0, q + 0.0)[0], slopes)
+    assert [run.arguments["outputs"] for run in runs] == [("psi_q", "psi", "psi_dot")]
     assert not np.allclose(terms.psi(0.0, q + 0.1), psi)  # of another position
     q += 0.1  # and of the same array with other numbers
     assert not np.allclose(terms.slopes(0.0, q)[0], slopes)

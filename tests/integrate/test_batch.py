@@ -10,6 +10,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax as udk
+from tests.calls import calls_of
 from udkjax.equations.programs.unrolled import Unrolled
 from udkjax.native import primitive, runs
 
@@ -99,17 +100,17 @@ def test_one_direction_for_all_members(pendulum):
 
 
 @pytest.mark.slow
-def test_only_what_the_parameters_touch_is_differentiated(monkeypatch):
+def test_only_what_the_parameters_touch_is_differentiated():
     """A link's mass appears in few constants of a linkage. Only these are differentiated."""
-    linkage, found, machine_code = udk.library.parallelogram(np.deg2rad(-45)), [], primitive.machine_code
+    linkage = udk.library.parallelogram(np.deg2rad(-45))
 
     def angle(mass):
         changed = linkage.with_parameters({"body.link1.mass": mass})
         return udk.simulate(changed, jnp.linspace(0.0, 1.0, 3), adjoint=diffrax.ForwardMode()).q[-1, 0, 2]
 
-    monkeypatch.setattr(primitive, "machine_code", lambda kind, *lanes: found.append(kind) or machine_code(kind, *lanes))
-    jax.jit(jax.jacfwd(angle)).lower(1.0)
-    (run,) = (x for x in found if isinstance(x, runs.RunTangents))
+    with calls_of(primitive._select_code) as found:
+        jax.jit(jax.jacfwd(angle)).lower(1.0)
+    (run,) = (x for x in (call.arguments["operation"] for call in found) if isinstance(x, runs.RunTangents))
     assert sum(run.active) == 1 and len(run.active) > 30
     unrolled = Unrolled(run.code, [], [("a",)], run.active)
     assert 1 <= len(unrolled.moving) <= 8 < len(run.code.constants)

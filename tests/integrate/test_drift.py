@@ -10,9 +10,8 @@ import pytest
 
 import udkjax as udk
 from tests.choices import fast
+from tests.ten_times import multiplied
 from udkjax import Result
-from udkjax.native import primitive
-from udkjax.native.parts import elimination, projection
 
 TS = np.linspace(0.0, 5.0, 26)
 TIGHT = {"rtol": 1e-8, "atol": 1e-8, "throw": False}
@@ -236,31 +235,23 @@ def test_ten_times_more_or_less_changes_no_verdict(factor, monkeypatch):
     before = verdicts()
     assert before == [Result.singular] * 3 + [Result.successful] * 2
     assert verdicts(drift_tol=1e-3 * factor) == before
-    monkeypatch.setattr(elimination, "NEAREST", elimination.NEAREST * factor)
-    primitive.generate.cache_clear()
-    primitive.machine_code.cache_clear()
-    assert verdicts() == before
-    primitive.generate.cache_clear()
-    primitive.machine_code.cache_clear()
+    with multiplied(factor, "pinv.auto.NEAREST"):
+        assert verdicts() == before
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("factor", [0.1, 1.0, 10.0])
-def test_ten_times_more_or_less_refuses_no_projected_run_across_singular_configurations(factor, monkeypatch):
+def test_ten_times_more_or_less_refuses_no_projected_run_across_singular_configurations(factor):
     """The bound of Psi after a projection, in tolerances."""
-    monkeypatch.setattr(projection, "CLOSED_TOL", projection.CLOSED_TOL * factor)
-    primitive.generate.cache_clear()
-    primitive.machine_code.cache_clear()
-    for mech in (swing(), swing(0.9), kite(), equal_crank(), udk.library.n_four_bar(2), udk.library.peaucellier(1.1, 2.0)):
-        for method in (udk.Auto(), udk.SVD(1e-4), udk.Elimination(1e-3)):
+    with multiplied(factor, "native.module.steps.CLOSED_TOL"):
+        for mech in (swing(), swing(0.9), kite(), equal_crank(), udk.library.n_four_bar(2), udk.library.peaucellier(1.1, 2.0)):
+            for method in (udk.Auto(), udk.SVD(1e-4), udk.Elimination(1e-3)):
 
-            def code(tol, mech=mech, method=method):
-                return udk.simulate(mech, TS, method=method, rtol=tol, atol=tol, throw=False).code
+                def code(tol, mech=mech, method=method):
+                    return udk.simulate(mech, TS, method=method, rtol=tol, atol=tol, throw=False).code
 
-            codes = jax.vmap(code)(jnp.array([1e-3, 1e-5, 1e-7, 1e-9, 1e-11]))
-            assert codes.tolist() == [Result.successful] * 5, (mech.name, method)
-    primitive.generate.cache_clear()
-    primitive.machine_code.cache_clear()
+                codes = jax.vmap(code)(jnp.array([1e-3, 1e-5, 1e-7, 1e-9, 1e-11]))
+                assert codes.tolist() == [Result.successful] * 5, (mech.name, method)
 
 
 @pytest.mark.slow

@@ -1,6 +1,5 @@
 """Runs by machine code compose with every transformation of JAX, and compiled code is stored safely on disk."""
 
-import itertools
 import os
 import re
 import subprocess
@@ -15,6 +14,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 import udkjax as udk
+from tests.calls import calls_of
 from tests.choices import fast
 from udkjax import threads
 from udkjax.native import primitive, records
@@ -138,12 +138,10 @@ def test_a_large_batch_stores_no_records(way, monkeypatch):
     """Its members are integrated again: all bits are those of a batch with records."""
     slope, rtols = IN_A_BATCH[way], jnp.array([1e-4, 1e-6, 1e-8, 1e-10])
     expected = jax.jit(slope)(INERTIAS, rtols)
-    asked = []
     monkeypatch.setattr(records, "LARGEST", 0)
-    absent = records.absent_records
-    monkeypatch.setattr(records, "absent_records", lambda *given: asked.append(given) or absent(*given))
     jax.clear_caches()
-    assert_array_equal(jax.jit(slope)(INERTIAS, rtols), expected)
+    with calls_of(records.absent_records) as asked:
+        assert_array_equal(jax.jit(slope)(INERTIAS, rtols), expected)
     assert asked
     jax.clear_caches()
 
@@ -227,11 +225,9 @@ def test_threads_of_xla_share_a_large_batch():
 def test_a_limit_of_threads_holds_inside_and_outside_of_compiled_programs(monkeypatch, limit):
     monkeypatch.setattr(threads, "cores", lambda: 8)
     monkeypatch.setenv("UDKJAX_THREADS", str(limit or ""))
-    used, call = [], primitive.PreparedCall.__call__
-    monkeypatch.setattr(primitive.PreparedCall, "__call__", lambda self: used.append(self.threads) or call(self))
-    with jax.disable_jit():
+    with jax.disable_jit(), calls_of(primitive.PreparedCall.__call__) as calls:
         jax.vmap(angles)(jnp.linspace(0.3, 0.45, 800))
-    assert used == [limit or 8]
+    assert [call.arguments["self"].threads for call in calls] == [limit or 8]
     compared = re.findall(r"icmp slt i64 %\w+, 3\b", handler(Memory(), "call_frame")[-1].text())
     assert len(compared) == (limit is not None)
 
@@ -288,7 +284,7 @@ RUNS = {
 
 
 @pytest.mark.parametrize(("refused", "run"), [*(("malloc", name) for name in RUNS), ("realloc", "reverse")])
-def test_every_allocation_is_checked(monkeypatch, refused, run):
+def test_every_allocation_is_checked(monkeypatch, record_length, refused, run):
     """All allocations of one kind fail: a call of malloc or realloc in the code is replaced by null."""
     call, replaced, load = re.compile(rf"call ptr @{refused}\([^)]*\)"), [], primitive.load
 
@@ -297,7 +293,7 @@ def test_every_allocation_is_checked(monkeypatch, refused, run):
         return load(call.sub("inttoptr i64 0 to ptr", text), *arguments)
 
     monkeypatch.setattr(primitive, "load", load_refused)
-    monkeypatch.setattr(record, "STORED", 1)  # so that the second pass allocates records,
+    record_length(1)  # so that the second pass allocates records,
     monkeypatch.setattr(record, "FIRST_POINTS", -4)  # too short ones
 
     def forget():  # what holds code under the name of an operation
@@ -352,36 +348,24 @@ def test_a_file_that_is_not_whole_is_made_again(folder, spoil):
     assert file.read_bytes() == whole
 
 
-def test_the_folder_stays_bounded(folder, monkeypatch):
-    assert answer() == 42.0
-    monkeypatch.setattr(code_cache, "MAX_BYTES", 3 * code_cache.cached_files()[0][1])
-    monkeypatch.setattr(code_cache, "WRITES_OF_CHECK", 1)
-    for k in range(5):
-        assert answer(TEXT.replace("4.2e1", f"{k}.0")) == k
-    assert len(list(folder.iterdir())) == 3
-
-
-def test_the_least_recently_used_files_are_deleted(folder, monkeypatch):
+def test_the_least_recently_used_files_are_deleted(folder):
     """Reading a file marks it as used, at most once a day."""
-    monkeypatch.setattr(code_cache, "_writes", iter([1, 2, 3, 0]))
     for name, days in (("daily", 40), ("never", 30), ("today", 0)):
         code_cache.write(name, bytes(1000))
         os.utime(folder / name, (time.time(), time.time() - days * 86_400 - 60))
     before = (folder / "today").stat().st_mtime
     assert code_cache.read("daily") == code_cache.read("today") == bytes(1000)
     assert (folder / "today").stat().st_mtime == before
-    monkeypatch.setattr(code_cache, "MAX_BYTES", 3500)
     code_cache.write("new", bytes(1000))
+    code_cache.evict(3500)
     assert {file.name for file in folder.iterdir()} == {"daily", "today", "new"}
 
 
-def test_the_folder_is_listed_once_in_many_writes(folder, monkeypatch):
-    listed = []
-    monkeypatch.setattr(code_cache, "cached_files", lambda: listed.append(0) or [])
-    monkeypatch.setattr(code_cache, "_writes", itertools.count())
-    for k in range(code_cache.WRITES_OF_CHECK + 1):
-        code_cache.write(str(k), b"")
-    assert len(listed) == 2
+def test_the_folder_stays_bounded_by_a_look_at_it_in_many_writes(folder):
+    with calls_of(code_cache.evict, code_cache.cached_files) as calls:
+        for k in range(2 * code_cache.WRITES_OF_CHECK):
+            code_cache.write(str(k), b"")
+    assert [call.arguments.get("most") for call in calls] == [None, code_cache.MAX_BYTES] * 2
 
 
 @pytest.mark.skipif(os.name != "posix", reason="homes are found otherwise")

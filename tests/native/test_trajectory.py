@@ -14,6 +14,7 @@ from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
 
 import udkjax as udk
+from tests.calls import calls_of
 from tests.choices import fast
 from tests.textbook import terms
 
@@ -58,19 +59,12 @@ def agrees(mechanism, ts, atol=1e-6, **choices):
 
 
 @pytest.fixture(autouse=True)
-def served(monkeypatch, request):
+def served(request):
     """Require machine code for all of these runs, except in tests that check this themselves."""
-    seen, module = [], import_module("udkjax.integrate.simulate")
-    finish = module._finish
-
-    def finish_and_note(run, *given):
-        seen.append(run.problem.compiled.plan.is_native)
-        return finish(run, *given)
-
-    monkeypatch.setattr(module, "_finish", finish_and_note)
-    yield seen
+    with calls_of(import_module("udkjax.integrate.simulate")._finish) as calls:
+        yield calls
     if "served" not in inspect.signature(request.function).parameters:
-        assert all(seen)
+        assert all(call.arguments["run"].problem.compiled.plan.is_native for call in calls)
 
 
 @pytest.mark.parametrize("name", fast(FAST, udk.library.__all__))

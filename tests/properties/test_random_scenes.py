@@ -30,8 +30,9 @@ from experiments.parts.reference_equations import evaluate
 from experiments.parts.state_properties import check_large, check_states
 from experiments.parts.tally import Tally
 from experiments.properties import PROPERTIES, page
+from tests.calls import calls_of
 from udkjax.cli import main
-from udkjax.integrate.events import simulate_events
+from udkjax.integrate.events.run.plain_system import run_plain
 from udkjax.scene.tables.schema import CLASSES_BY_TYPE
 
 SEED = 3
@@ -105,7 +106,7 @@ def test_loads_that_rounds_do_not_settle_are_followed_from_those_without_frictio
 
 
 @pytest.mark.slow
-def test_forces_are_watched_where_loads_are_followed_from_those_without_friction(monkeypatch):
+def test_forces_are_watched_where_loads_are_followed_from_those_without_friction():
     """A block beside such a mechanism sticks in machine code, which does not leave the run to its plain form."""
     scene = with_friction(random_scene(0, 161, 5))
     (q, v), beside, kg, m, s = state_of(scene.table), build(scene.table), scene.mass, scene.length, scene.time
@@ -117,25 +118,27 @@ def test_forces_are_watched_where_loads_are_followed_from_those_without_friction
         {**beside.forces, "pull": pull, "stick": udk.Friction("S", coefficient=0.2, law="set-valued")},
         gravity=beside.gravity,
     )
-    monkeypatch.delattr(simulate_events, "_deferred_run")  # the only way to the plain form
     state, ts = udk.State(*(np.vstack([x, np.zeros(3)]) for x in (q, v))), [0.0, 0.05 * s]
-    run = udk.simulate(mechanism, ts, state, rtol=1e-10, atol=1e-10)
-    alone = udk.simulate(beside, ts, udk.State(q, v), rtol=1e-10, atol=1e-10)
+    with calls_of(run_plain) as plain:
+        run = udk.simulate(mechanism, ts, state, rtol=1e-10, atol=1e-10)
+        alone = udk.simulate(beside, ts, udk.State(q, v), rtol=1e-10, atol=1e-10)
+    assert plain == []
     assert run.sticking is not None and run.sticking["S"].all()
     np.testing.assert_allclose(run.q[-1, :-1], alone.q[-1], rtol=1e-7)
 
 
 @pytest.mark.slow
-def test_a_run_that_ends_where_friction_jams_does_not_leave_machine_code(monkeypatch):
+def test_a_run_that_ends_where_friction_jams_does_not_leave_machine_code():
     """Loads grow without bound at its end, which is the same at any tolerance."""
     scene = random_scene(11, 51, 0, bodies=(2, 5))
     rub = {"type": "friction", "coefficient": 0.3, "radius": 0.3 * scene.length, "law": "set-valued"}
     pins = [joint["name"] for joint in scene.table["joint"] if joint["type"] == "revolute"]
     others = [force for force in scene.table["force"] if force["type"] != "friction"]
     table = scene.table | {"force": [*others, *({"name": f"rub {pin}", "joint": pin} | rub for pin in pins)]}
-    monkeypatch.delattr(simulate_events, "_deferred_run")  # the only way to the plain form
     for tol in (1e-6, 1e-8, 1e-10):
-        run = udk.simulate(build(table), np.linspace(0.0, 3 * scene.time, 31), rtol=tol, atol=tol, throw=False)
+        with calls_of(run_plain) as plain:
+            run = udk.simulate(build(table), np.linspace(0.0, 3 * scene.time, 31), rtol=tol, atol=tol, throw=False)
+        assert plain == []
         assert run.result == udk.Result.step_too_small and run.settings["engine"] == "native"
         assert float(run.time) == pytest.approx(0.1157806638384, rel=1e-10)
 

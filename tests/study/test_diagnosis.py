@@ -14,6 +14,7 @@ from scipy.optimize import brentq
 from scipy.sparse import csr_array
 
 import udkjax as udk
+from tests.calls import calls_of
 from tests.scaling import scaled
 from udkjax.pinv.sparse_gram import SmallSingularValues
 from udkjax.scene import GROUND
@@ -303,15 +304,14 @@ def test_traced_numbers_are_refused():
         jax.jit(ask)(1.0)
 
 
-def test_mechanisms_are_built_for_the_fixes_that_are_named(monkeypatch):
+def test_mechanisms_are_built_for_the_fixes_that_are_named():
     """Two braced cells of six bars: each bar has a fix. Of the second step only the best one is verified."""
     bodies = {f"{k}{i}": udk.Body(1.0, 0.01, [float(k), float(i)]) for k in range(3) for i in (0, 1)}
     pairs = [(f"{k}{i}", f"{k + 1}{j}") for k in (0, 1) for i in (0, 1) for j in (0, 1)] + [(f"{k}0", f"{k}1") for k in range(3)]
     joints: dict[str, Any] = {f"{a} {b}": udk.Distance([a, b], [[0.0, 0.0]] * 2) for a, b in pairs}
     joints["pin"] = udk.Revolute([GROUND, "00"], [[0.0, 0.0]] * 2)
-    built, apply = [], fix_search.apply_change
-    monkeypatch.setattr(fix_search, "apply_change", lambda *given: built.append(given) or apply(*given))
-    found = udk.diagnose(udk.Mechanism(bodies, joints), walk=False)
+    with calls_of(fix_search.apply_change) as built:
+        found = udk.diagnose(udk.Mechanism(bodies, joints), walk=False)
     assert len(found.redundancies) == 2 and len(found.cure) == 2
     assert found.cured is not None and udk.analyse(found.cured).redundant == ()
     assert len(built) == len({fix.constraint for r in found.redundancies for fix in r.fixes}) + 1
@@ -333,7 +333,7 @@ def umbrella(ribs):
 
 def test_many_redundant_sets_are_advised_in_a_line_each_with_few_decompositions(monkeypatch):
     """Each change was tried by a decomposition of the Jacobian in each position, and by building the mechanism anew."""
-    decompose, large, ranked, rank = np.linalg.svd, [], [], RankedPositions.__init__
+    decompose, large = np.linalg.svd, []
 
     def counted(matrix, *given, **choices):
         large.append(min(np.shape(matrix)[-2:]) > 10)
@@ -341,9 +341,9 @@ def test_many_redundant_sets_are_advised_in_a_line_each_with_few_decompositions(
 
     mech = umbrella(2)
     udk.diagnose(mech, walk=False, fixes=False)
-    monkeypatch.setattr(RankedPositions, "__init__", lambda self, *given: ranked.append(0) or rank(self, *given))
     monkeypatch.setattr(np.linalg, "svd", counted)
-    found = udk.diagnose(mech, walk=False)
+    with calls_of(RankedPositions.__init__) as ranked:
+        found = udk.diagnose(mech, walk=False)
     assert len(ranked) == 1 and sum(large) < 900
     assert sum(r.count for r in found.redundancies) == sum(fix.removes for fix in found.cure) == 8
     assert found.cured is not None

@@ -13,11 +13,11 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax as udk
+from tests.calls import calls_of as noted_calls
 from tests.choices import fast
-from udkjax.equations.programs import eliminated_steps
+from tests.ten_times import multiplied
 from udkjax.equations.programs.scene_arrays import SceneArrays
 from udkjax.positions.following.drive import without_drivers
-from udkjax.study import driver_efforts
 
 TIMES = np.linspace(0.0, 1.0, 11)
 ANGLES = 1.0 + 0.2 * TIMES
@@ -99,14 +99,17 @@ def test_calls_of_diagnosis_and_derivation():
     assert calls_of(lambda: udk.holding_efforts(four_bar, "body.crank.angle", ANGLES)) < 4_900
 
 
+WORTH_ELIMINATING = "equations.programs.eliminated_steps.WORTH"
+
+
 @pytest.mark.parametrize("mechanism", [udk.library.four_bar, udk.library.slider_crank, lambda: LINKAGE, udk.library.peaucellier])
-def test_a_diagnosis_by_elimination_is_that_by_singular_values(mechanism, monkeypatch):
+def test_a_diagnosis_by_elimination_is_that_by_singular_values(mechanism):
     """Also across the singular positions of redundant rows, where branches meet."""
     scene, found = mechanism(), []
     name = f"body.{scene.body_names[0]}.mass"
-    for worth in (10**6, 0):
-        monkeypatch.setattr(eliminated_steps, "WORTH", worth)
-        found.append(udk.diagnose(scene.with_parameters({name: 1.1})))
+    for factor in (1e4, 0.0):
+        with multiplied(factor, WORTH_ELIMINATING):
+            found.append(udk.diagnose(scene.with_parameters({name: 1.1})))
     slow, fast = found
     assert str(slow) == str(fast)
     assert_allclose(fast.clearance.searched, slow.clearance.searched, rtol=1e-12)
@@ -116,16 +119,13 @@ def test_a_diagnosis_by_elimination_is_that_by_singular_values(mechanism, monkey
 
 
 @pytest.mark.parametrize("mechanism", [sprung_four_bar, lambda: LOADED], ids=["four_bar", "redundant rows"])
-def test_a_position_of_rest_by_elimination_is_that_by_singular_values(mechanism, monkeypatch):
+def test_a_position_of_rest_by_elimination_is_that_by_singular_values(mechanism):
     """The shortest corrections in units of the scene are the same by both, up to rounding, also of redundant rows."""
     scene, found = mechanism(), []
-    for worth in (10**6, 0):
-        monkeypatch.setattr(eliminated_steps, "WORTH", worth)
-        calls = []
-        newton_step = SceneArrays.newton_step
-        monkeypatch.setattr(SceneArrays, "newton_step", lambda *given, calls=calls, f=newton_step: calls.append(1) or f(*given))
-        found.append(udk.equilibrium(scene.with_parameters({"force.spring.stiffness": 2.9})))
-        assert bool(calls) == (worth == 0)
+    for factor in (1e4, 0.0):
+        with multiplied(factor, WORTH_ELIMINATING), noted_calls(SceneArrays.newton_step) as calls:
+            found.append(udk.equilibrium(scene.with_parameters({"force.spring.stiffness": 2.9})))
+        assert bool(calls) == (factor == 0.0)
     slow, fast = found
     assert slow.balanced and fast.balanced
     assert_allclose(fast.q, slow.q, atol=1e-13)
@@ -133,13 +133,12 @@ def test_a_position_of_rest_by_elimination_is_that_by_singular_values(mechanism,
 
 
 @pytest.mark.parametrize("drivers", fast(["one", "lengths"], MOTORS))
-def test_efforts_by_numpy_are_those_by_jax(drivers, monkeypatch):
+def test_efforts_by_numpy_are_those_by_jax(drivers):
     """Also in the parallelogram's singular position, where branches meet, and beyond it."""
     angles = np.append(ANGLES, [np.pi, 3.4])
     drivers, motion = MOTORS[drivers], udk.kinematics(LOADED, "body.link1.angle", angles, rate=2.0, acceleration=0.3)
     found = udk.inverse_dynamics(LOADED, angles, motion, list(drivers))
-    monkeypatch.setattr(driver_efforts, "efforts_by_numpy", lambda *given: None)
-    expected = udk.inverse_dynamics(LOADED, angles, motion, list(drivers))
+    expected = jax.jit(lambda angles: udk.inverse_dynamics(LOADED, angles, motion, list(drivers)))(angles)
     for name in expected.efforts:
         assert_allclose(found.efforts[name], expected.efforts[name], rtol=1e-9)
         assert_allclose(found.powers[name], expected.powers[name], rtol=1e-9)
@@ -163,9 +162,7 @@ def test_efforts_of_one_freedom_follow_from_powers(monkeypatch):
     drivers, weights = ["body.crank.angle", "body.rocker.angle"], {"body.rocker.angle": 3.0}
     found = udk.inverse_dynamics(linkage, ANGLES, motion, drivers, weights)
     assert inverted == []  # two drivers of one degree of freedom are no square system: singular values
-    with monkeypatch.context() as patched:
-        patched.setattr(driver_efforts, "efforts_by_numpy", lambda *given: None)
-        expected = udk.inverse_dynamics(linkage, ANGLES, motion, drivers, weights)
+    expected = jax.jit(lambda angles: udk.inverse_dynamics(linkage, angles, motion, drivers, weights))(ANGLES)
     for name in drivers:
         assert_allclose(found.efforts[name], expected.efforts[name], rtol=1e-9)
     udk.inverse_dynamics(linkage, ANGLES, motion, drivers[:1])

@@ -7,6 +7,7 @@ import pytest
 from numpy.testing import assert_array_equal
 
 import udkjax as udk
+from tests.calls import calls_of
 from tests.choices import needs_deferred
 from udkjax.native import primitive
 from udkjax.native.code import machine
@@ -20,14 +21,8 @@ def calls(monkeypatch, tmp_path):
     monkeypatch.setenv("UDKJAX_CACHE", str(tmp_path))
     monkeypatch.setattr(machine, "_compiler", lambda: str(tmp_path))  # whose code nobody has loaded
     primitive.machine_code.cache_clear()
-    made, call = [], primitive.LoadedCode._call_quickly
-
-    def noted(self, inputs, shapes):
-        made.append((self, inputs, shapes, call(self, inputs, shapes)))
-        return made[-1][-1]
-
-    monkeypatch.setattr(primitive.LoadedCode, "_call_quickly", noted)
-    yield made
+    with calls_of(primitive.LoadedCode._call_quickly) as made:
+        yield made
     primitive.machine_code.cache_clear()
 
 
@@ -50,23 +45,22 @@ def crank(length, method=None):
 def test_both_codes_round_alike(calls, run):
     run()
     assert calls
-    for code, inputs, shapes, found in calls:
-        for a, b in zip(found, code.prepare(inputs, shapes)(), strict=True):
+    for _, given, found in list(calls):
+        for a, b in zip(found, given["self"].prepare(given["inputs"], given["shapes"])(), strict=True):
             assert_array_equal(a, b)
 
 
 def test_a_run_of_many_steps_is_of_optimized_code(calls, monkeypatch):
     monkeypatch.setattr(primitive, "QUICK_STEPS", 10)
     found = udk.simulate(udk.library.four_bar(), TS)
-    *_, (code, _, _, outputs) = calls
-    assert outputs is None and code._optimized.library.is_optimized
+    assert calls[-1].result is None and calls[-1].arguments["self"]._optimized.library.is_optimized
     assert found.result == udk.Result.successful and found.stats["steps"] > 10
 
 
 def test_a_limit_of_the_user_stays_one(calls):
     mechanism = udk.library.four_bar()
     assert udk.simulate(mechanism, TS, max_steps=5, throw=False).result == udk.Result.step_limit
-    assert all(found is not None for *_, found in calls)
+    assert all(call.result is not None for call in calls)
 
 
 def test_what_is_called_often_is_optimized(calls, monkeypatch):

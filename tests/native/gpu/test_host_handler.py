@@ -21,6 +21,7 @@ from jax.interpreters import mlir
 from numpy.testing import assert_allclose, assert_array_equal
 
 import udkjax as udk
+from tests.calls import calls_of
 from tests.choices import needs_deferred
 from udkjax.native import primitive, records
 from udkjax.native.gpu import host_handler
@@ -367,19 +368,19 @@ def test_a_program_with_loops_or_factorizations_is_one_call(request, name):
 
 
 @needs_deferred
-def test_such_a_program_is_compiled_once_and_runs_under_strict_settings(card, monkeypatch):
+def test_such_a_program_is_compiled_once_and_runs_under_strict_settings(card):
     """It produces NaN in places that the surrounding program discards."""
 
     @deferred
     def undefined(x):
         return singular_values(x) / (x - x)
 
-    made, make = [], host_program.HostProgram._packed
-    monkeypatch.setattr(host_program.HostProgram, "_packed", lambda self, words: made.append(self) or make(self, words))
     x = jnp.asarray(2.0)
     programs = [jax.jit(f) for f in (lambda x: jnp.nan_to_num(undefined(x)), lambda x: jnp.where(x > 0, x, undefined(x)))]
-    for program in programs:
-        program(x)
+    with calls_of(host_program.HostProgram._packed) as calls:
+        for program in programs:
+            program(x)
+    made = [id(call.arguments["self"]) for call in calls]
     assert len(set(made)) == len(made)
     with jax.transfer_guard("disallow"), jax.debug_nans(True):
         jax.block_until_ready([program(x) for program in programs])

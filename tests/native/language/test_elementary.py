@@ -12,6 +12,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 import udkjax as udk
+from tests.calls import calls_of
 from tests.fused import is_fused
 from tests.native.language.test_program import ONE, TWO
 from udkjax.expressions import Graph, ScalarProgram, trace
@@ -231,9 +232,7 @@ class Everything(udk.ForceElement):
 
 
 @pytest.mark.slow
-def test_modules_of_runs_and_derivatives_need_memory_management_alone(monkeypatch):
-    texts, split = [], machine.split_module
-    monkeypatch.setattr(machine, "split_module", lambda text: (texts.append(text), split(text))[1])
+def test_modules_of_runs_and_derivatives_need_memory_management_alone():
     plain = udk.library.compound_pendulum()
     mechanism = udk.Mechanism(plain.bodies, plain.joints, forces={"all": Everything(plain.body_names)})
     inertia = float(mechanism.bodies["rod"].inertia)
@@ -245,8 +244,11 @@ def test_modules_of_runs_and_derivatives_need_memory_management_alone(monkeypatc
     step = 1e-3
     slope = (angle(inertia + step) - angle(inertia - step)) / (2.0 * step)
     curvature = (angle(inertia + step) - 2.0 * angle(inertia) + angle(inertia - step)) / step**2
-    assert_allclose([jax.grad(angle)(inertia), jax.jacfwd(angle)(inertia)], slope, rtol=1e-4)
-    assert_allclose(jax.jacfwd(jax.jacfwd(angle))(inertia), curvature, rtol=1e-3)
+    with calls_of(machine.split_module) as splits:
+        jax.clear_caches()
+        assert_allclose([jax.grad(angle)(inertia), jax.jacfwd(angle)(inertia)], slope, rtol=1e-4)
+        assert_allclose(jax.jacfwd(jax.jacfwd(angle))(inertia), curvature, rtol=1e-3)
+    texts = [call.arguments["text"] for call in splits]
     assert any("@erf_f64" in text for text in texts)
     assert frozenset().union(*map(external_functions, texts)) <= {"malloc", "free", "realloc"}
 

@@ -7,8 +7,8 @@ from types import ModuleType
 
 import pytest
 
+from tests.calls import calls_of
 from tests.integrate.systems.test_own_methods import BenIsrael
-from udkjax.native.code import code_cache
 from udkjax.native.lowering import own_objects
 from udkjax.native.lowering.source_key import source_key
 from udkjax.native.pseudoinverses.own import OwnCode
@@ -112,12 +112,12 @@ def test_text_is_stored(tmp_path, monkeypatch):
     code = OwnCode.of(BenIsrael())
     found = code.written(3, 4)
     assert len(list(tmp_path.glob("text-*"))) == 2
-    own_objects.written.cache_clear()
-    monkeypatch.setattr(own_objects, "_write", None)
-    again = code.written(3, 4)
-    assert again.function.text() == found.function.text()
-    assert again.size == found.size
-    own_objects.written.cache_clear()
-    monkeypatch.setattr(code_cache, "read", lambda name: None)
-    with pytest.raises(TypeError):
+    with calls_of(own_objects._write) as writes:
+        own_objects.written.cache_clear()
+        again = code.written(3, 4)
+        assert again.function.text() == found.function.text()
+        assert again.size == found.size and writes == []
+        own_objects.written.cache_clear()
+        monkeypatch.setenv("UDKJAX_CACHE", "0")
         code.written(3, 4)
+        assert writes != []

@@ -5,6 +5,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 import udkjax as udk
+from tests.calls import calls_of
 from tests.choices import fast
 from tests.wasm_host import Host, run_without_contraction
 from udkjax.equations import analyse
@@ -25,51 +26,38 @@ def both(operation, inputs, times):
     return host.run(made.module, inputs, shapes), run_without_contraction(made.module, inputs, shapes)
 
 
-def concrete_call(monkeypatch, module, do):
-    """The operation and the inputs of the first call of machine code by `do()` through a module of the package."""
-    seen = []
-
-    def call(operation, inputs, times):
-        seen.append((operation, inputs, times))
-        return primitive.call_concrete(operation, inputs, times)
-
-    monkeypatch.setattr(module, "call_concrete", call)
-    do()
-    return seen[0]
+def first_call(run):
+    """The result of a run, and the operation and the inputs of its machine code."""
+    with calls_of(primitive.call_concrete) as calls:
+        found = run()
+    given = next(call.arguments for call in calls if isinstance(call.arguments["operation"], runs.RunStates))
+    return found, (given["operation"], given["inputs"], given["times"])
 
 
 @pytest.mark.parametrize("name", fast(["parallelogram"], udk.library.__all__))
-def test_a_run(monkeypatch, name):
+def test_a_run(name):
     mechanism, ts = getattr(udk.library, name)(), TIMES * SPANS.get(name, 1.0)
-    found = []
-    operation, inputs, times = concrete_call(
-        monkeypatch, native_engine, lambda: found.append(udk.simulate(mechanism, ts, engine="native"))
-    )
+    found, (operation, inputs, times) = first_call(lambda: udk.simulate(mechanism, ts, engine="native"))
     wasm, native = both(operation, inputs, times)
     for x, y in zip(wasm, native, strict=True):
         assert_array_equal(x, y)
     # And the motion itself is that of the engine on this processor, within what the tolerance leaves open.
     length = float(analyse(mechanism).length)
-    assert_allclose(wasm[0][0, 1:-1], np.asarray(found[0].q).reshape(len(TIMES), -1)[1:-1], rtol=0, atol=1e-6 * max(length, 1.0))
+    assert_allclose(wasm[0][0, 1:-1], np.asarray(found.q).reshape(len(TIMES), -1)[1:-1], rtol=0, atol=1e-6 * max(length, 1.0))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", fast(["slider_crank"], udk.library.__all__))
-def test_a_run_up_to_where_a_condition_crosses_zero(monkeypatch, name):
+def test_a_run_up_to_where_a_condition_crosses_zero(name):
     mechanism, ts = getattr(udk.library, name)(), TIMES * SPANS.get(name, 1.0)
     body, path = mechanism.body_names[0], np.asarray(udk.simulate(mechanism, ts).q)[:, 0]
     k = int(np.argmax(np.ptp(path, axis=0)))
     middle, coordinate = float(path[:, k].min() + path[:, k].max()) / 2, ("x", "y", "angle")[k]
     event = udk.Event(lambda t, at: getattr(at[body], coordinate) - middle, udk.Stop())
-    seen, call_members = [], primitive.call_members
-
-    def call(*inputs, operation, times):
-        seen.append((operation, inputs, times))
-        return call_members(*inputs, operation=operation, times=times)
-
-    monkeypatch.setattr(primitive, "call_members", call)
-    events = udk.simulate(mechanism, ts, events=[event]).events
-    operation, inputs, times = [x for x in seen if isinstance(x[0], runs.RunWatched)][-1]
+    with calls_of(primitive.call_members) as calls:
+        events = udk.simulate(mechanism, ts, events=[event]).events
+    given = [call.arguments for call in calls if isinstance(call.arguments["operation"], runs.RunWatched)][-1]
+    operation, inputs, times = given["operation"], given["inputs"], given["times"]
     wasm, native = both(operation, inputs, times)
     for x, y in zip(wasm, native, strict=True):
         assert_array_equal(x, y)
@@ -94,29 +82,21 @@ def test_closing(name):
 
 
 @pytest.mark.slow
-def test_a_scene_that_runs_by_loops(monkeypatch):
-    mechanism, found = udk.library.n_four_bar(14), []
-    times = np.linspace(0.0, 0.2, 5)
-    operation, inputs, count = concrete_call(
-        monkeypatch, native_engine, lambda: found.append(udk.simulate(mechanism, times, engine="native"))
-    )
+def test_a_scene_that_runs_by_loops():
+    mechanism, times = udk.library.n_four_bar(14), np.linspace(0.0, 0.2, 5)
+    found, (operation, inputs, count) = first_call(lambda: udk.simulate(mechanism, times, engine="native"))
     assert not operation.code.is_small
     wasm, native = both(operation, inputs, count)
     for x, y in zip(wasm, native, strict=True):
         assert_array_equal(x, y)
-    assert_allclose(wasm[0][0, 1:-1], np.asarray(found[0].q).reshape(len(times), -1)[1:-1], rtol=0, atol=1e-6)
+    assert_allclose(wasm[0][0, 1:-1], np.asarray(found.q).reshape(len(times), -1)[1:-1], rtol=0, atol=1e-6)
 
 
-def test_marching(monkeypatch):
-    seen, of_one = [], primitive.MemberCalls.of_one
-
-    def call(calls, *inputs, times):
-        seen.append((calls._operation, inputs, times))
-        return of_one(calls, *inputs, times=times)
-
-    monkeypatch.setattr(primitive.MemberCalls, "of_one", call)
-    udk.kinematics(udk.library.slider_crank(), "motor", np.linspace(0.0, 1.0, 21))
-    operation, inputs, times = seen[0]
+def test_marching():
+    with calls_of(primitive.MemberCalls.of_one) as calls:
+        udk.kinematics(udk.library.slider_crank(), "motor", np.linspace(0.0, 1.0, 21))
+    given = calls[0].arguments
+    operation, inputs, times = given["self"]._operation, given["inputs"], given["times"]
     assert isinstance(operation, position_operations.March)
     wasm, native = both(operation, inputs, times)
     for x, y in zip(wasm, native, strict=True):

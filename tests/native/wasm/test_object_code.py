@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from tests.calls import calls_of
 from tests.wasm_host import Host
 from udkjax.native.code import machine
 from udkjax.native.language import elementary
@@ -85,11 +86,10 @@ def test_constants_are_at_the_beginning_of_memory():
 def test_what_is_compiled_once_is_read_from_disk(monkeypatch, tmp_path):
     monkeypatch.setenv("UDKJAX_CACHE", str(tmp_path))
     linked = compile_wasm(doubled("run", 2.0).text(), ("run",))
-    monkeypatch.setattr(machine, "object_code", lambda *_: pytest.fail("it is compiled again"))
-    assert compile_wasm(doubled("run", 2.0).text(), ("run",)) == linked
-    (tmp_path / next(iter(tmp_path.iterdir())).name).write_bytes(b"half")
-    with pytest.raises(pytest.fail.Exception):
-        compile_wasm(doubled("run", 2.0).text(), ("run",))
+    with calls_of(machine.object_code) as compiled:
+        assert compile_wasm(doubled("run", 2.0).text(), ("run",)) == linked and not compiled
+        (tmp_path / next(iter(tmp_path.iterdir())).name).write_bytes(b"half")
+        assert compile_wasm(doubled("run", 2.0).text(), ("run",)) == linked and compiled
 
 
 def test_what_is_missing_is_named():

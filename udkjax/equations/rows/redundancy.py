@@ -23,9 +23,9 @@ class FoundRows(NamedTuple):
 
 
 @np.errstate(all="ignore")  # non-finite coordinates are not closed
-def examine_rows(mechanism: Mechanism) -> FoundRows:
-    """Find redundant rows, and pins held to second order. All numbers are concrete."""
-    rows = kinematic_rows(mechanism)
+def examine_rows(mechanism: Mechanism, large: bool | None = None) -> FoundRows:
+    """Find redundant rows, and pins held to second order, by `kinematic_rows`. All numbers are concrete."""
+    rows = kinematic_rows(mechanism, large)
     if not rows.count:
         return FoundRows((), (), None)
     q = np.asarray(mechanism.q0, float).ravel()
@@ -36,9 +36,9 @@ def examine_rows(mechanism: Mechanism) -> FoundRows:
     return FoundRows(redundant, held, balance, positions[-1].q if positions and balance else None)
 
 
-def redundant_rows(mechanism: Mechanism) -> tuple[int, ...] | None:
+def redundant_rows(mechanism: Mechanism, large: bool | None = None) -> tuple[int, ...] | None:
     """Return the rows of Psi to leave out; None if the guess cannot be closed or moved. All numbers are concrete."""
-    return examine_rows(mechanism).redundant
+    return examine_rows(mechanism, large).redundant
 
 
 def dependent_constraints(mechanism: Mechanism, q: np.ndarray) -> tuple[str, ...]:

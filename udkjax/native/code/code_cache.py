@@ -107,7 +107,7 @@ def write(name: str, code: bytes) -> None:
             Path(temporary).unlink(missing_ok=True)
             raise
         if next(_writes) % WRITES_OF_CHECK == 0:
-            _evict()
+            evict(MAX_BYTES)
     except OSError:  # not writable: run without a cache
         return
 
@@ -115,10 +115,10 @@ def write(name: str, code: bytes) -> None:
 _writes = itertools.count()  # of this process
 
 
-def _evict() -> None:
-    """Delete the least recently used files above the limit."""
+def evict(most: int) -> None:
+    """Delete the least recently used files above a limit of their total size (bytes)."""
     files = sorted(cached_files())
-    excess = sum(size for _, size, _ in files) - MAX_BYTES
+    excess = sum(size for _, size, _ in files) - most
     for _, size, file in files:
         if excess <= 0:
             return

@@ -249,7 +249,7 @@ class StageEquations:
 
 
 class StagesOfChosenSteps(StageEquations):
-    """The stages of a module that chooses the method of each step, with what the choice needs.
+    """The stages of a module that chooses the method of each step, and the numbers that the choice needs.
 
         smooth_error(work)    D^(-1) of the error of velocities, where an implicit step is tried
 

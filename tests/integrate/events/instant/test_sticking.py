@@ -11,6 +11,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import udkjax as udk
+from tests.calls import calls_of
 from tests.friction import G, pendulum
 from udkjax.native.primitive import PreparedCall
 
@@ -90,11 +91,11 @@ def test_block_slides_up_and_sticks_for_ever():
     assert solution.events.of("S sticks") == pytest.approx([stop], abs=1e-12)
 
 
-def test_a_stop_takes_few_calls_of_machine_code(monkeypatch):
+def test_a_stop_takes_few_calls_of_machine_code():
     """At the start: one state, one decision, the marks of rows, a run. At the stop as many, and a projection."""
-    scene, calls, call = block(0.2, 2.0, coefficient=0.3), [], PreparedCall.__call__
-    monkeypatch.setattr(PreparedCall, "__call__", lambda self: (calls.append(self), call(self))[1])
-    solution = udk.simulate(scene, [0.0, 2.0], **TOL)
+    scene = block(0.2, 2.0, coefficient=0.3)
+    with calls_of(PreparedCall.__call__) as calls:
+        solution = udk.simulate(scene, [0.0, 2.0], **TOL)
     assert solution.events.counts["S sticks"] == 1 and len(calls) <= 9
 
 

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 from scipy.special import gamma
 
 import udkjax as udk
+from tests.calls import calls_of
 from tests.integrate.events.run.passing import by_the_loop, counted
 from udkjax.equations.systems.smooth_loads import SmoothLoads
 from udkjax.expressions.scalars import scalar_program
@@ -249,13 +250,14 @@ def test_the_end_of_a_power_is_located():
     np.testing.assert_allclose(slopes, exact, rtol=1e-7)  # the slope of x^1.5 has no bounded slope itself
 
 
-def test_no_operation_within_a_run_waits_for_jax(monkeypatch):
+def test_no_operation_within_a_run_waits_for_jax():
     """A run with kinks is a function that XLA calls: JAX may wait for the thread that runs it."""
-    monkeypatch.setattr(scalar_program, "_evaluate_by_jax", lambda node, values: pytest.fail(str(node.detail)))
-    for kind in KINDS:
-        element = kind(["b"], k=np.array(2.0))
-        renewal = SmoothLoads.of_element(element, ["b"], False).renewal
-        assert len(renewal.by_numpy([np.full(3, 0.3)] * len(renewal.inputs))) == len(renewal.outputs) > 0
+    with calls_of(scalar_program._evaluate_by_jax) as by_jax:
+        for kind in KINDS:
+            element = kind(["b"], k=np.array(2.0))
+            renewal = SmoothLoads.of_element(element, ["b"], False).renewal
+            assert len(renewal.by_numpy([np.full(3, 0.3)] * len(renewal.inputs))) == len(renewal.outputs) > 0
+    assert by_jax == []
 
 
 @pytest.mark.slow
@@ -316,10 +318,9 @@ QUICK = ("default", "events")
 def test_machine_code_passes_kinks_as_the_loop_of_events_does(case, monkeypatch):
     options = {"ts": np.linspace(0.0, 3.0, 301), "rtol": 1e-8, "atol": 1e-8} | CASES[case]
     run = lambda: udk.simulate(swinging(), **options)  # noqa: E731
-    with monkeypatch.context() as context:
-        found, calls, most = counted(context, run)
+    found, calls, most = counted(run)
     by_the_loop(monkeypatch)
-    expected, more_calls, _ = counted(monkeypatch, run)
+    expected, more_calls, _ = counted(run)
     kinks, events = int(expected.stats["kinks"]), 0 if expected.events is None else int(expected.events.count)
     assert more_calls > kinks / 2 > 10 and most > 10 and calls <= kinks / most + events + 7  # some kinks are simultaneous
     # To the bit where multiplications are fused with additions; elsewhere the two round in other places.

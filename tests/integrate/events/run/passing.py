@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from tests.calls import calls_of
 from udkjax.integrate.events.run.machine_system import MachineSystem
 from udkjax.integrate.events.run.phase_code import PhaseCode
 
@@ -11,8 +12,8 @@ def by_the_loop(monkeypatch, passed: int = 0):
     monkeypatch.setattr(MachineSystem, "_events_to_pass", lambda self, runs, members, most: np.full(len(members), passed))
 
 
-def counted(monkeypatch, run):
+def counted(run):
     """Return the result of a run, the number of its stretches, and the most events that one of them passes."""
-    calls, stretch = [], PhaseCode.run
-    monkeypatch.setattr(PhaseCode, "run", lambda *given: calls.append(given) or stretch(*given))
-    return run(), len(calls), calls[0][0].plan.run.passing.most
+    with calls_of(PhaseCode.run) as calls:
+        found = run()
+    return found, len(calls), calls[0].arguments["self"].plan.run.passing.most

@@ -15,8 +15,9 @@ from scipy.optimize import brentq
 from scipy.special import erf
 
 import udkjax as udk
+from tests.calls import calls_of
 from tests.integrate.events.event_scenes import Level
-from udkjax.integrate.events import simulate_events
+from udkjax.integrate.events.run.host_run import PlainForm
 from udkjax.integrate.events.run.phase_code import PhaseCode
 
 POINT = udk.Mechanism({"b": udk.Body(1.0, 0.1, velocity=[1.0, 0])}, gravity=[0, 0])  # x = t
@@ -105,18 +106,16 @@ def test_stop_stops_at_the_first_crossing_and_jumps_and_kinks_count_once():
     assert len(sol.events.of("kink")) == len(expected) and np.abs(sol.events.of("kink") - expected).max() < 1e-12
 
 
-def test_a_condition_costs_no_step_and_an_event_few(monkeypatch):
+def test_a_condition_costs_no_step_and_an_event_few():
     """A pendulum logs where it passes and where it turns. Machine code runs once for each event."""
-    runs, run = [], PhaseCode.run
-    monkeypatch.setattr(PhaseCode, "run", lambda *given: runs.append(0) or run(*given))
-    monkeypatch.setattr(simulate_events, "_deferred_run", None)
     pendulum = udk.Mechanism(
         {"link": udk.Body(1.0, 0.1, position=(0.5, 0.0))}, {"A": udk.Revolute(("ground", "link"), [[0, 0], [-0.5, 0]])}
     )
     events, ts = (lambda t, at: at["link"].x, lambda t, at: at["link"].omega), np.linspace(0, 8, 40)
-    found = udk.simulate(pendulum, ts, events=[udk.Event(condition, udk.Log()) for condition in events], max_events=60)
-    assert found.events.count == 16 and len(runs) == 17
-    never = udk.simulate(pendulum, ts, events=udk.Event(lambda t, at: at["link"].y - 3.0))
+    with calls_of(PhaseCode.run, PlainForm.__call__) as runs:
+        found = udk.simulate(pendulum, ts, events=[udk.Event(condition, udk.Log()) for condition in events], max_events=60)
+        assert found.events.count == 16 and [run.function for run in runs] == [PhaseCode.run] * 17
+        never = udk.simulate(pendulum, ts, events=udk.Event(lambda t, at: at["link"].y - 3.0))
     plain = udk.simulate(pendulum, ts)
     assert len(runs) == 18 and np.array_equal(never.q, plain.q) and never.stats["steps"] == plain.stats["steps"]
     work = [int(sol.stats["right_hand_sides"]) for sol in (plain, never, found)]

@@ -65,10 +65,9 @@ def test_machine_code_passes_events_as_the_loop_does(case, monkeypatch):
     mechanism, options, most_calls = CASES[case]
     options = {"ts": TS, "rtol": 1e-10, "atol": 1e-10} | options
     run = lambda: udk.simulate(mechanism, **options)  # noqa: E731
-    with monkeypatch.context() as context:
-        found, calls, _ = counted(context, run)
+    found, calls, _ = counted(run)
     by_the_loop(monkeypatch)
-    expected, more_calls, _ = counted(monkeypatch, run)
+    expected, more_calls, _ = counted(run)
     assert calls <= most_calls and more_calls >= len(np.unique(expected.events.time))
     np.testing.assert_array_equal(found.events.index, expected.events.index)
     np.testing.assert_allclose(found.events.time, expected.events.time, rtol=0, atol=1e-8)
@@ -79,7 +78,7 @@ def test_machine_code_passes_events_as_the_loop_does(case, monkeypatch):
 def test_the_record_of_events_is_filled_again_and_again(monkeypatch):
     """A call that has passed as many events as its record has room for ends, and the next goes on."""
     by_the_loop(monkeypatch, passed=2)
-    few, calls, _ = counted(monkeypatch, lambda: udk.simulate(CHAIN, TS))
+    few, calls, _ = counted(lambda: udk.simulate(CHAIN, TS))
     assert calls > 10
     monkeypatch.undo()
     many = udk.simulate(CHAIN, TS)

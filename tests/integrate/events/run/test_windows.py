@@ -2,6 +2,7 @@
 
 # pyright: reportOptionalMemberAccess=false, reportOptionalSubscript=false
 # All of these runs have events.
+from collections.abc import Iterator
 from typing import Any
 
 import equinox as eqx
@@ -11,31 +12,22 @@ import pytest
 
 import udkjax as udk
 from experiments.parts.random_scenes import build, random_scene, state_of
+from tests.calls import Call, calls_of
 from tests.integrate.events.instant.test_sticking import Bumper, belt, block, oscillator, sticking
 from tests.integrate.motions.test_redundant_friction import doubled
-from udkjax.integrate.events import simulate_events
 from udkjax.integrate.events.run.host_run import PlainForm
 from udkjax.integrate.events.run.machine_system import MachineSystem
+from udkjax.integrate.events.run.plain_system import run_plain
 
 TOL: dict[str, Any] = {"rtol": 1e-10, "atol": 1e-10}
 
 
 @pytest.fixture
-def windows(monkeypatch: pytest.MonkeyPatch) -> list[float]:
-    """Forbid the plain form; return a list, to which each window adds its start."""
-    starts: list[float] = []
-    advance = MachineSystem._advance_window
-
-    def noted(system: MachineSystem, runs: Any, member: int):
-        starts.append(float(runs.t[member]))
-        advance(system, runs, member)
-
-    def forbidden(*_: Any):
-        raise AssertionError("the run has left machine code")
-
-    monkeypatch.setattr(MachineSystem, "_advance_window", noted)
-    monkeypatch.setattr(PlainForm, "__call__", forbidden)
-    return starts
+def windows() -> Iterator[list[Call]]:
+    """Note the windows of a run, which may not take the plain form."""
+    with calls_of(MachineSystem._advance_window, PlainForm.__call__, run_plain) as calls:
+        yield calls
+    assert all(call.function is MachineSystem._advance_window for call in calls), "the run has left machine code"
 
 
 @pytest.fixture
@@ -59,7 +51,7 @@ def noise(t: Any, at: Any) -> Any:
     return jnp.sin(1e13 * at["b"].x + 1.0) + 2 * jnp.sin(3e12 * at["b"].x)
 
 
-def test_a_condition_that_is_too_fast_does_not_leave_machine_code(windows, monkeypatch):
+def test_a_condition_that_is_too_fast_does_not_leave_machine_code(windows):
     point = udk.Mechanism({"b": udk.Body(1.0, 0.1, velocity=[1.0, 0])}, gravity=[0, 0])
     events = udk.Event(noise, udk.Log(), name="noise")
 
@@ -67,7 +59,6 @@ def test_a_condition_that_is_too_fast_does_not_leave_machine_code(windows, monke
         return udk.simulate(mechanism, [0, 0.5, 1.0], events=events, max_events=5, throw=False)
 
     in_jit = eqx.filter_jit(run)(point)
-    monkeypatch.delattr(simulate_events, "_deferred_run")  # the other way to the plain form
     with pytest.warns(UserWarning, match='"noise" from 0 s'):
         found = run(point)
     assert windows and found.result == in_jit.result == udk.Result.successful
@@ -76,7 +67,7 @@ def test_a_condition_that_is_too_fast_does_not_leave_machine_code(windows, monke
 
 
 @pytest.mark.parametrize("coefficient", [0.2, 0.5])
-def test_pins_that_chatter_at_a_stiff_bumper_do_not_leave_machine_code(windows, monkeypatch, coefficient):
+def test_pins_that_chatter_at_a_stiff_bumper_do_not_leave_machine_code(windows, coefficient):
     """Weak pins may stick and slip faster than time resolves, until the bumper has come to rest with the rod on it.
 
     Rounding decides whether they do, and so whether there are windows; other tests force them.
@@ -92,9 +83,8 @@ def test_pins_that_chatter_at_a_stiff_bumper_do_not_leave_machine_code(windows, 
     }
     rubs = {name: udk.Friction(name, coefficient=coefficient, radius=0.3, law="set-valued") for name in joints}
     bumper = Bumper(["tip"], 1e7, jnp.asarray(1e3))
-    monkeypatch.delattr(simulate_events, "_deferred_run")
     run = udk.simulate(udk.Mechanism(bodies, joints, forces={**rubs, "bumper": bumper}), [0.0, 4.0])
-    assert run.settings["engine"] == "native" and max(windows, default=0.0) < 4.0
+    assert run.settings["engine"] == "native" and all(call.arguments["runs"].t.max() <= 4.0 for call in windows)
     assert run.sticking["A"][-1] and run.sticking["B"][-1] and np.abs(run.v[-1]).max() < 1e-9
     # About the pin, with the arm sqrt(1 - 0.3^2) m of the bumper: its force less the weights, at most mu r |R|.
     force, weight, arm = 1e7 * max(-0.3 - run.q[-1, 1, 1], 0.0), 9.81 * 1.5, np.cos(run.q[-1, 0, 2])
@@ -145,7 +135,7 @@ def test_a_crossing_within_rounding_errors_is_found_once(windows, from_the_start
     np.testing.assert_allclose(found.events.time, expected.events.time, rtol=0, atol=1e-7 * end)
 
 
-def test_contacts_at_rest_beside_stiff_dampers_need_no_windows(windows: list[float]):
+def test_contacts_at_rest_beside_stiff_dampers_need_no_windows(windows: list[Call]):
     """Velocities within the tolerance times a damping of 2e7 N m s are torques much larger than the force of the contact."""
     bodies = {
         "lower": udk.Body(1.56, 0.166, (0.10615263197169834, 0.5132920240034046), 1.3822542012872183),
