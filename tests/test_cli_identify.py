@@ -72,6 +72,28 @@ def test_it_draws_from_the_posterior_and_continues(tmp_path, capsys, data):
 
 
 @pytest.mark.slow
+def test_a_posterior_that_cannot_be_drawn_is_refused_by_name(tmp_path, capsys, data):
+    """Parameters that nothing determines, bounds that exclude the optimum, and a folder with another posterior."""
+    pytest.importorskip("arviz")
+
+    def draw(*options) -> tuple[int, str]:
+        arguments = ["identify", PENDULUM, data, "--ignore", "remark", "--starts", "0", "--tol", "1e-8", "--quiet"]
+        status = udkjax(*arguments, "--out", tmp_path / "found", "--posterior", tmp_path / "posterior", *options)
+        return status, capsys.readouterr().err
+
+    status, shown = draw("--parameters", MASS, INERTIA)
+    assert status == 2 and "Traceback" not in shown
+    assert f"neither the records nor a prior determine {MASS} and {INERTIA}: give one of them a prior or bounds" in shown
+    assert (tmp_path / "found" / "estimate.json").exists()  # the fit is kept
+    status, shown = draw("--parameters", INERTIA, "--bounds", f"{INERTIA}=0.3,0.45")
+    assert "Traceback" not in shown
+    with xarray.open_dataset(tmp_path / "posterior" / "draws.nc", group="posterior", engine="h5netcdf") as draws:
+        assert 0.3 < draws[INERTIA].min() < draws[INERTIA].max() < 0.45 < TRUTH
+    status, shown = draw("--parameters", INERTIA)
+    assert status == 2 and "contains another posterior" in shown and "Traceback" not in shown
+
+
+@pytest.mark.slow
 def test_what_is_known_before_makes_it_known(tmp_path, capsys, data):
     out = tmp_path / "found"
     options = ["--prior", f"{MASS}=2.0,0.002", "--bounds", f"{INERTIA} = 0.2,0.9", "--noise", CHANNEL + f"={np.radians(NOISE)}"]

@@ -85,8 +85,10 @@ def test_a_damaged_chunk_is_computed_again_and_no_other(tmp_path, damage):
 
 
 def test_another_sweep_is_refused_and_the_difference_spelled_out(tmp_path):
-    with FolderStore(tmp_path, FINGERPRINT):
+    with FolderStore(tmp_path, {"settings": "of a sweep that finished no chunk"}):
         pass
+    with FolderStore(tmp_path, FINGERPRINT) as stored:
+        stored.write(CHUNKS[0], data(CHUNKS[0]))
     before = (tmp_path / "sweep.json").read_bytes()
     other = {"settings": {"rtol": 1e-9}, "scene": "format = 1\nmass = 2.0\n", "axes": [1.0, 2.5, float("nan")]}
     with pytest.raises(StoreError) as caught:

@@ -115,7 +115,7 @@ class FolderStore:
             yield data.pop(MEMBERS), {name.removeprefix(STORED_PREFIX): values for name, values in data.items()}
 
     def _begin(self, sweep: dict[str, JsonValue]) -> None:
-        """Write the fingerprint of the sweep, or compare it with an existing one."""
+        """Write the fingerprint of the sweep, or compare it with an existing one of which a chunk is finished."""
         for file in (*self.folder.glob(f"*{UNFINISHED_SUFFIX}"), *(self.folder / CHUNKS).glob(f"*{UNFINISHED_SUFFIX}")):
             file.unlink(missing_ok=True)  # file of a process that was killed while writing
         manifest = self.folder / f"{self.what}.json"
@@ -123,8 +123,8 @@ class FolderStore:
             begun = json.loads(manifest.read_text(encoding="utf-8"))
         except (FileNotFoundError, ValueError, RecursionError):
             begun = None
-        if isinstance(begun, dict):
-            if found := differences(begun, sweep):
+        if isinstance(begun, dict) and (not (found := differences(begun, sweep)) or self._files()):
+            if found:
                 lines = "\n  ".join(found)
                 raise StoreError(f"{self.folder} contains another {self.what}: {ADVICE}. Differences:\n  {lines}")
             return
