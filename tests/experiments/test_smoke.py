@@ -25,6 +25,7 @@ SLOW: set[str] = {
     "spread",
     "atlas",
     "curves",
+    "posteriors",
     "properties",  # a slice of it: tests/properties
 }
 LARGER = {"atlas.nc": 2_000_000}  # bytes of a hundred thousand runs
