@@ -349,7 +349,11 @@ def test_beside_joints_that_stick_and_answers_about_the_run():
     assert solution.events.counts["one"] == 1
     resting, feet = plate(0.0, coefficient=0.3)
     still: Any = udk.simulate(resting, [0.0, 1.0], events=feet)
-    assert udk.reactions(resting, still) == {}
+    found = udk.reactions(resting, still)
+    assert set(found) == {"foot -0.5.contact", "foot 0.5.contact"}
+    for x in (-0.5, 0.5):  # each foot bears half of the weight
+        half = 9.81 / 2
+        np.testing.assert_allclose(found[f"foot {x}.contact"]["plate"], 2 * [[0.0, half, x * half]], atol=1e-9)
     assert udk.power_balance(resting, still).kinetic.shape == (2,)
     assert sticking_spans(resting, still) == []
 
