@@ -158,3 +158,23 @@ def test_contacts_at_rest_beside_stiff_dampers_need_no_windows(windows: list[Cal
     )
     assert [run.events.count, exact.events.count, windows] == [2, 2, []]
     assert np.abs(run.q - exact.q).max() < 1e-4
+
+
+@pytest.mark.parametrize(("rtol", "atol"), [(1e-8, 1e-8), (1e-11, 1e-11), (0.0, 1e-8)])
+def test_tolerances_beside_stiff_dampers_are_tightened_as_far_as_rounding_allows(rtol: float, atol: float, windows: list[Call]):
+    """A joint at its limit beside a damper of 7.7e7 N m s holds at tolerances of 1e-12, and seemed to let go at 1e-11."""
+    bodies = {
+        "lower": udk.Body(0.321, 0.143, (-0.222, 0.373), 2.2617, (-0.19, -0.113), 0.509),
+        "middle": udk.Body(1.861, 0.164, (-0.765, 0.792), 2.9428, (-0.381, -0.023), -0.368),
+        "upper": udk.Body(1.579, 0.191, (-0.92, 0.799), -0.0232, (-0.346, 0.131), 0.129),
+    }
+    joints = {
+        "foot": udk.Revolute(("ground", "lower"), ((0.0, 0.0), (-0.429, 0.067))),
+        "knee": udk.Revolute(("lower", "middle"), ((0.383, -0.154), (-0.414, -0.058))),
+        "hip": udk.Revolute(("middle", "upper"), ((0.359, -0.003), (-0.198, 0.063))),
+    }
+    damper = udk.TorsionSpring(("lower", "middle"), stiffness=5.0, angle=0.681, damping=7.7e7)
+    mechanism = udk.Mechanism(bodies, joints, forces={"damper": damper})
+    limit = udk.JointLimit("foot", lower=1.463, upper=2.768, restitution=0.0)
+    run = udk.simulate(mechanism, [0.0, 0.8], rtol=rtol, atol=atol, events=[limit], max_steps=2000)
+    assert [run.events.count, windows] == [2, []]

@@ -29,7 +29,7 @@ from udkjax.native.runs import RunStates
 
 STATUS, TIME, COUNTS, WRITTEN, IMPLICIT = 0, 1, slice(2, 5), 5, 7  # of `RunStates.info_names`
 INFO = len(RunStates.info_names)
-# Where forces vary too quickly, tolerances are tightened by factors of `TIGHTER`, at most to `TIGHTEST`, where errors of steps
+# Where forces vary too quickly, tolerances are tightened by factors of `TIGHTER`, and at last to `TIGHTEST`, where errors of steps
 # are rounding errors. A thousandth leaves two tries at most at usual tolerances; each costs the steps of a start alone.
 TIGHTER, TIGHTEST = 1e-3, 1e-12
 
@@ -317,8 +317,9 @@ class MachineSystem:
         to let go and to hold in turn.
         """
         holds = self.plan.watched(runs.phase[members], runs.carried[members], np)[:, self.plan.count :].any(axis=1)
-        tighter = TIGHTER * self._tightened[members]
-        helps = holds & (self._phases[which].tolerances(members) * tighter >= TIGHTEST)
+        before = self._tightened[members]
+        tighter = np.maximum(TIGHTER * before, TIGHTEST / self._phases[which].tolerances(members))
+        helps = holds & (tighter < before)
         self._tightened[members[helps]] = tighter[helps]
         return helps
 

@@ -193,8 +193,9 @@ class PhaseCode:
         return _of(self._settings, members)[:, [self.plan.run.all_settings.index("atol")]]
 
     def tolerances(self, members: Int[np.ndarray, "b"]) -> Float[np.ndarray, "b"]:
-        """Return the smaller one of the relative tolerance and the absolute one, in units of the scene, of members."""
-        return np.broadcast_to(_of(self._settings, members)[:, self._tolerances].min(axis=1), len(members))
+        """Return the smaller one of the relative tolerance and the absolute one, in units of the scene, that are not zero."""
+        both = _of(self._settings, members)[:, self._tolerances]
+        return np.broadcast_to(np.where(both > 0, both, np.inf).min(axis=1), len(members))
 
     def run(
         self, members: Int[np.ndarray, "b"], ts: np.ndarray, state: RunState, watch: np.ndarray, tightened: Float[np.ndarray, "b"]
