@@ -29,7 +29,7 @@ from udkjax.native.runs import RunStates
 
 STATUS, TIME, COUNTS, WRITTEN, IMPLICIT = 0, 1, slice(2, 5), 5, 7  # of `RunStates.info_names`
 INFO = len(RunStates.info_names)
-# Where forces vary too quickly, tolerances are tightened by factors of `TIGHTER`, and at last to `TIGHTEST`, where errors of steps
+# Where forces vary too quickly, tolerances are tightened by factors of `TIGHTER`, at last to `TIGHTEST`, where errors of steps
 # are rounding errors. A thousandth leaves two tries at most at usual tolerances; each costs the steps of a start alone.
 TIGHTER, TIGHTEST = 1e-3, 1e-12
 
