@@ -193,6 +193,7 @@ CONSTRUCTORS: list[tuple[Any, dict[str, Any], str, str]] = [
     *((udk.PoseGoal, POSE, name, f"{name} must be") for name in ("body", "targets", "arm", "pin", "values", "start", "line")),
     *((udk.FunctionGoal, FUNCTION, name, f"{name} must be") for name in ("output", "values", "targets", "output_start")),
     *((udk.ToleranceGoal, TOLERANCE, name, f"{name} must ") for name in ("point", "tolerances", "most", "weight", "samples")),
+    (udk.RobustGoal, {"goal": udk.EnergyGoal(most=1.0), "tolerances": {"gravity": 0.1}}, "sigmas", "sigmas must "),
     (udk.LoadGoal, {"most": 1.0}, "joint", "joint must be"),
     (udk.MotionGoal, {"most": 1.0}, "function", "function must be"),
 ]

@@ -83,6 +83,7 @@ def objects() -> dict[str, object]:
         udk.CurveGoal("P", [[0, 0], [1, 1], [2, 0]]),
         *(udk.TorqueGoal(most=1.0), udk.LoadGoal("a", most=1.0), udk.EnergyGoal(least=1.0), udk.FrequencyGoal(least=1.0)),
         *(udk.GapGoal("a", "b", least=1.0), udk.ToleranceGoal("a", {}, most=1.0), udk.MotionGoal(anything, most=1.0)),
+        udk.RobustGoal(udk.EnergyGoal(most=1.0), {"gravity": 0.1}),
         *(
             (batch := udk.PositionBatch(linkage, "joint.C.angle", ["gravity"])),
             batch({"gravity": np.zeros((2, 2))}, np.array([0.1])),

@@ -194,8 +194,6 @@ from udkjax.study.sweep import Sobol as Sobol
 from udkjax.study.sweep import SweepError as SweepError
 from udkjax.study.sweep import Zipped as Zipped
 from udkjax.study.sweep import sweep as sweep
-from udkjax.study.tolerancing import PinClearance as PinClearance
-from udkjax.study.tolerancing import Tolerance as Tolerance
 from udkjax.study.tolerancing import ToleranceAnalysis as ToleranceAnalysis
 from udkjax.study.tolerancing import tolerances as tolerances
 from udkjax.study.worked.solution import WorkedSolution as WorkedSolution
@@ -214,7 +212,10 @@ from udkjax.synthesis import LoadGoal as LoadGoal
 from udkjax.synthesis import MotionGoal as MotionGoal
 from udkjax.synthesis import MotionPoint as MotionPoint
 from udkjax.synthesis import PathGoal as PathGoal
+from udkjax.synthesis import PinClearance as PinClearance
 from udkjax.synthesis import PoseGoal as PoseGoal
+from udkjax.synthesis import RobustGoal as RobustGoal
+from udkjax.synthesis import Tolerance as Tolerance
 from udkjax.synthesis import ToleranceGoal as ToleranceGoal
 from udkjax.synthesis import TorqueGoal as TorqueGoal
 from udkjax.synthesis import design as design

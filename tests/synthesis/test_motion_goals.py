@@ -126,7 +126,7 @@ def test_limits_and_speeds_of_goal_files_have_units():
     problems = []
 
     def read(**given):
-        return goal_file._read_motion(0, udk.library.four_bar(), given, Units({"length": "mm"}), problems)
+        return goal_file._read_motion("motion[0]", udk.library.four_bar(), None, given, Units({"length": "mm"}), problems)
 
     found = read(kind="torque", most="2 N mm", least="1 N mm", speed="60 rpm")
     assert found is not None

@@ -61,8 +61,6 @@ from udkjax.study.sweep.grid import load_grid as load_grid
 from udkjax.study.sweep.plan import SweepPlan as SweepPlan
 from udkjax.study.sweep.plan import make_plan as make_plan
 from udkjax.study.sweep.sweep import duration as duration
-from udkjax.study.tolerancing import PinClearance as PinClearance
-from udkjax.study.tolerancing import Tolerance as Tolerance
 from udkjax.study.tolerancing import ToleranceAnalysis as ToleranceAnalysis
 from udkjax.study.tolerancing import tolerances as tolerances
 from udkjax.study.worked.exercises import write_course as write_course

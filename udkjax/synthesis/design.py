@@ -164,9 +164,8 @@ def design(
     Args:
         drawing: the structure: a drawing, or a mechanism with one degree of freedom when its drivers are removed. Free pins
             only define which links they join.
-        goal: a `PathGoal`, `PoseGoal`, `FunctionGoal` or `CurveGoal`; or a list of one of these and motion
-            goals: `TorqueGoal`, `LoadGoal`,
-            `EnergyGoal`, `FrequencyGoal`, `GapGoal`, `ToleranceGoal` and `MotionGoal`.
+        goal: a `PathGoal`, `PoseGoal`, `FunctionGoal` or `CurveGoal`; or a list of one of these and motion goals: `TorqueGoal`,
+            `LoadGoal`, `EnergyGoal`, `FrequencyGoal`, `GapGoal`, `ToleranceGoal`, `RobustGoal` and `MotionGoal`.
         free: names of the free numbers, such as `pin.A` or `pin.C[0]`; by default all pins, with their
             lengths and angles.
         bounds: (low, high) by the names of free numbers; low and high are numbers, or arrays of the free number's shape (m).

@@ -21,6 +21,7 @@ from udkjax.synthesis.goals import Goal, PathGoal, goal_scale, place_of
 from udkjax.synthesis.limits import LEAST_TRANSMISSION, Bounds, LengthLimits
 from udkjax.synthesis.motion_goals import MotionTerm
 from udkjax.synthesis.motion_terms import CompiledTerm
+from udkjax.synthesis.robust.robust_goal import RobustGoal, RobustTerm
 from udkjax.synthesis.trials import TrialResiduals, Trials, Turn
 from udkjax.wording import quote
 
@@ -89,15 +90,23 @@ class DesignProblem:
 
     def _compile_terms(self, terms: Sequence[MotionTerm]) -> list[CompiledTerm]:
         goal, span = self.goal, None
-        if terms and not self.rotation:
+        if any(term.positional not in (None, goal) for term in terms):
+            problem = "goal: a RobustGoal measures targets that are not those of the design; give it the goal of the design"
+            raise SceneError([problem], self.mechanism.name)
+        if any(term.positional is None for term in terms) and not self.rotation:
             if goal.values is None:
                 problem = (
                     "goal: a motion is measured over a whole turn or over values: give the first goal values, or set rotation"
                 )
                 raise SceneError([problem], self.mechanism.name)
             span = float(goal.values[0]), float(goal.values[-1])
-        where = self._unit, self.scale, span, self.unknowns, goal.origin, self.shifted
-        return [CompiledTerm(term, self.mechanism, self.free, self.driver, self.driven, *where) for term in terms]
+        where = {"unit": self._unit, "scale": self.scale, "span": span, "unknowns": self.unknowns}
+        where |= {"origin": goal.origin, "shifted": self.shifted}
+        base = self.mechanism, self.free, self.driver, self.driven
+        return [
+            RobustTerm(term, *base, **where) if isinstance(term, RobustGoal) else CompiledTerm(term, *base, **where)
+            for term in terms
+        ]
 
     def _compile(self):
         goal, count = self.goal, self.free.count

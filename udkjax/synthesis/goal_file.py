@@ -20,6 +20,7 @@ from udkjax.synthesis.curves.curve_file import read_curve_file
 from udkjax.synthesis.design import DesignSearch
 from udkjax.synthesis.goals import FunctionGoal, Goal, PathGoal, PoseGoal
 from udkjax.synthesis.motion_goals import EnergyGoal, FrequencyGoal, GapGoal, LoadGoal, MotionTerm, ToleranceGoal, TorqueGoal
+from udkjax.synthesis.robust.robust_goal import RobustGoal
 from udkjax.wording import plural, quote, unknown_key
 
 TOP = (
@@ -63,6 +64,8 @@ MOTION: dict[str, tuple[Callable[..., MotionTerm], str]] = {
     "gap": (GapGoal, "m"),
 }
 MOTION_KEYS = ("kind", "most", "least", "speed", "weight", "samples")
+KINDS = (*MOTION, "robust")
+ROBUST_KEYS = ("kind", "goal", "tolerances", "sigmas", "most", "weight")
 OWN_KEYS = {"load": ("joint",), "tolerance": ("point", "tolerances"), "gap": ("one", "other")}
 
 
@@ -95,7 +98,8 @@ def read_design(path: str | os.PathLike[str]) -> DesignSearch | CompleteSearch:
     goal = _read_goal(mechanism, _with_table(table["goal"], Path(path).parent, problems), units, problems)
     bounds = _read_bounds(mechanism, table.get("bounds", {}), units, problems)
     lengths = _read_lengths(table.get("length", []), units, problems)
-    terms = [_read_motion(k, mechanism, entry, units, problems) for k, entry in enumerate(table.get("motion", []))]
+    motions = [(f"motion[{k}]", entry) for k, entry in enumerate(table.get("motion", []))]
+    terms = [_read_motion(where, mechanism, goal, entry, units, problems) for where, entry in motions]
     areas = {pin: units.convert(f"areas.{pin}", area, "m", problems) for pin, area in dict(table.get("areas", {})).items()}
     transmission = units.convert("transmission", table.get("transmission", 0.0), "rad", problems)
     if problems:
@@ -167,10 +171,14 @@ def _read_goal(mechanism: Mechanism, table: Any, units: Units, problems: list[st
         return None
 
 
-def _read_motion(k: int, mechanism: Mechanism, table: Any, units: Units, problems: list[str]) -> MotionTerm | None:
-    where, kind = f"motion[{k}]", table.get("kind") if isinstance(table, Mapping) else None
+def _read_motion(
+    where: str, mechanism: Mechanism, goal: Goal | None, table: Any, units: Units, problems: list[str]
+) -> MotionTerm | None:
+    kind = table.get("kind") if isinstance(table, Mapping) else None
+    if kind == "robust":
+        return _read_robust(where, mechanism, goal, table, units, problems)
     if kind not in MOTION:
-        problems.append(f"{where}.kind must be one of {', '.join(map(quote, MOTION))}, not {quote(str(kind))}")
+        problems.append(f"{where}.kind must be one of {', '.join(map(quote, (*MOTION, 'robust')))}, not {quote(str(kind))}")
         return None
     make, unit = MOTION[kind]
     keys, before = (*MOTION_KEYS, *OWN_KEYS.get(kind, ())), len(problems)
@@ -188,6 +196,32 @@ def _read_motion(k: int, mechanism: Mechanism, table: Any, units: Units, problem
         return None
     try:
         return make(**given)
+    except (TypeError, ValueError) as problem:
+        problems.append(f"{where}: {problem}")
+        return None
+
+
+def _read_robust(
+    where: str, mechanism: Mechanism, goal: Goal | None, table: TomlTable, units: Units, problems: list[str]
+) -> MotionTerm | None:
+    """Return a robust goal of the motion goal in `goal`, or of the positional goal."""
+    before = len(problems)
+    problems += [f"{where}.{key}: {unknown_key(key, ROBUST_KEYS)}" for key in table if key not in ROBUST_KEYS]
+    plain = _read_motion(f"{where}.goal", mechanism, None, table["goal"], units, problems) if "goal" in table else goal
+    given: dict[str, Any] = {key: value for key, value in table.items() if key not in ("kind", "goal")}
+    problems += [] if "tolerances" in given else [f"{where}.tolerances: missing"]
+    if "most" in given:
+        si = _unit_of(goal.output) if isinstance(goal, FunctionGoal) else "m"  # pyright: ignore[reportArgumentType]
+        given["most"] = units.convert(f"{where}.most", given["most"], si, problems)
+    tolerances = given["tolerances"] = dict(given.get("tolerances", {}))
+    for name, x in tolerances.items():
+        if not isinstance(x, str):
+            si = mechanism.unit_of(name) if name in mechanism.parameters() else "m"
+            tolerances[name] = units.convert(f"{where}.tolerances.{name}", x, si, problems)
+    if len(problems) > before or plain is None:
+        return None
+    try:
+        return RobustGoal(plain, **given)
     except (TypeError, ValueError) as problem:
         problems.append(f"{where}: {problem}")
         return None

@@ -23,7 +23,7 @@ from udkjax.printing import PrintedTable, PrintsTable
 from udkjax.requirements import require_count, require_function, require_number, require_numbers_by_name, require_text
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.tables.checks import SceneError
-from udkjax.synthesis.goals import check_place, place_of
+from udkjax.synthesis.goals import Goal, check_place, place_of
 from udkjax.wording import quote, suggestion
 
 
@@ -41,6 +41,8 @@ class MotionPoint(NamedTuple):
         numbers: the free numbers.
         x: values of the free numbers in the trial (P,).
         psi: the function x (P,) -> Psi (m,) at this position.
+        target: the target of the positional goal at this position, if a `RobustGoal` measures it.
+        extras: further unknowns of the positional goal.
     """
 
     mechanism: Mechanism
@@ -53,6 +55,8 @@ class MotionPoint(NamedTuple):
     numbers: FreeNumbers
     x: Float[Array, "P"]
     psi: Callable[[Array], Array]
+    target: Float[Array, "G"]
+    extras: Float[Array, "E"]
 
     @property
     def missing(self) -> Float[Array, "n"]:
@@ -92,6 +96,11 @@ class MotionTerm(PrintsTable):
         if self.speed is not None:
             require_number("speed", self.speed)
         require_count("samples", self.samples)
+
+    @property
+    def positional(self) -> Goal | None:
+        """The positional goal whose targets are measured, if any."""
+        return None
 
     def check(self, mechanism: Mechanism, driven: Driven, free: Sequence[str]) -> None:
         """Raise `SceneError` if the mechanism lacks the measured element."""

@@ -65,31 +65,37 @@ class CompiledTerm:
         self.goal, self._unit, self._span = goal, unit, span
         self._unit_of_residuals = scale / np.sqrt(goal.samples)
         self._longest = CLOSURE.longest_step * float(driven.unit)
-        turning = span is None
-        base = position_model(free, driver, lambda *_: jnp.zeros(0), None if turning else origin, shifted and not turning)
+        measured = goal.positional
+        self._given = None if measured is None else measured.values
+        self._targets = np.zeros((goal.samples, 0)) if measured is None else measured.targets
+        self._turning, D = span is None and measured is None, self._targets.shape[1]
+        at_zero = (None, False) if self._turning else (origin, shifted)
+        base = position_model(free, driver, lambda *_: jnp.zeros(0), *at_zero)
         speed = goal.speed if goal.speed is not None else _speed(mechanism, driven.name)
 
         def psi(x: Array, s: Array, q: Array) -> Array:
             return base(x, s, q, jnp.zeros(0))["psi"]
 
-        def point(x: Array, s: Array, q: Array, u: Array, w: Array, y: Array) -> MotionPoint:
+        def point(x: Array, s: Array, q: Array, u: Array, w: Array, y: Array, d: Array) -> MotionPoint:
             q, u, w = (a.reshape(-1, 3) for a in (q, u, w))
             numbers = x[: free.count]
             at = lambda changed: psi(jnp.concatenate([changed, x[free.count :]]), s, q.ravel())  # noqa: E731
-            return MotionPoint(free.moved(numbers), q, speed * u, speed**2 * w, u, w, y, free, numbers, at)
+            moved, extras = free.moved(numbers), x[free.count + shifted :]
+            return MotionPoint(moved, q, speed * u, speed**2 * w, u, w, y, free, numbers, at, d, extras)
 
         def loads(x: Array, s: Array, q: Array, u: Array, w: Array) -> Array:
-            return goal.loads(point(x, s, q, u, w, jnp.zeros((0, 0))))
+            return goal.loads(point(x, s, q, u, w, jnp.zeros((0, 0)), jnp.zeros(D)))
 
         def measures(x: Array, s: Array, q: Array, u: Array, w: Array, y: Array, d: Array) -> Array:
-            return goal.measure(point(x, s, q, u, w, y)).reshape(1)
+            return goal.measure(point(x, s, q, u, w, y, d)).reshape(1)
 
         n = mechanism.q0.size
         programs = compile_programs(
             mechanism,
-            trace_model(base, unknowns, n),
+            trace_model(base, unknowns, n, D),
             unknowns,
             n,
+            data=D,
             transmission=False,
             rows=np.asarray(driven.analysis.scales.rows),
             motion=MotionModel(psi, loads, measures),
@@ -98,10 +104,15 @@ class CompiledTerm:
         self._code, self._drawn = position_code(mechanism, programs), programs.drawn_value
         self._places, self.entries = programs.places[0], programs.measure.outputs[programs.places[0].by_parameters]
 
-    def measures(self, x: np.ndarray, threads: int | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return measures (M, K), derivatives with respect to the unknowns (M, K, P), and whether all positions exist (M,)."""
-        s = self._values(x)
-        solved = self._code(x, s, self._unit, longest=self._longest, threads=threads)
+    def measures(
+        self, x: np.ndarray, threads: int | None = None, s: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return measures (M, K), derivatives with respect to the unknowns (M, K, P), and whether all positions exist (M,).
+
+        `s` are the values of the driver (M, K), by default those of the goal.
+        """
+        s = self.values(x) if s is None else s
+        solved = self._code(x, s, self._unit, self._targets, longest=self._longest, threads=threads)
         finite = np.isfinite(solved.end).all(1)
         out = np.where(finite[:, None, None], solved.out, 0.0)
         return out[..., self._places.value], out[..., self._places.by_parameters], finite
@@ -116,39 +127,45 @@ class CompiledTerm:
         """Return the residuals of measures (K,)."""
         return self.goal.residual(measures, self._unit_of_residuals)[0]
 
-    def _values(self, x: np.ndarray) -> np.ndarray:
+    def values(self, x: np.ndarray) -> np.ndarray:
+        """Return the values of the driver at which trials x (M, P) are measured (M, K)."""
         count = self.goal.samples
+        if self._given is not None:
+            return np.tile(self._given, (len(x), 1))
         if self._span is not None:
             return np.tile(np.linspace(*self._span, count), (len(x), 1))
         # Values on a grid that does not depend on the drawing, from the first one after the drawn value.
         step, drawn = FULL_TURN / count, np.asarray(self._drawn.by_numpy(list(x.T))[0])
         return step * (np.ceil(drawn / step)[:, None] + np.arange(count))
 
-    def measure_motion(self, mechanism: Mechanism, x: np.ndarray, origin: float) -> np.ndarray | None:
+    def measure_motion(
+        self, mechanism: Mechanism, x: np.ndarray, origin: float, s: np.ndarray | None = None
+    ) -> np.ndarray | None:
         """Return the measures (K,) of a mechanism's motion by `kinematics`; None if it does not reach them.
 
         Args:
             mechanism: the mechanism.
             x: its free numbers and further unknowns (P,).
             origin: the driver's value from which the span is measured.
+            s: the values of the driver, by default those of the goal.
         """
-        s = self._values(x[None])[0]
-        motion = kinematics(mechanism, self._driver, s if self._span is None else s + origin)
+        s = np.asarray(self.values(x[None])[0] if s is None else s)
+        motion = kinematics(mechanism, self._driver, s if self._turning else s + origin)
         if not np.all(motion.reached):
             return None
         q, u, w = (np.asarray(a).reshape(len(s), -1) for a in (motion.q, motion.v, motion.a))
-        return np.asarray(self._of_motion(jnp.asarray(x), s, q, u, w))
+        return np.asarray(self._of_motion(jnp.asarray(x), s, q, u, w, self._targets))
 
     @cached_property
     def _of_motion(self) -> Callable[..., Array]:
         psi, loads, measures = self._model
 
-        def one(x: Array, s: Array, q: Array, u: Array, w: Array) -> Array:
+        def one(x: Array, s: Array, q: Array, u: Array, w: Array, d: Array) -> Array:
             b, jacobian = loads(x, s, q, u, w), jax.jacfwd(lambda q: psi(x, s, q))(q)
             y = b @ jnp.linalg.pinv(jacobian) if len(b) else jnp.zeros((0, len(jacobian)))
-            return measures(x, s, q, u, w, y, jnp.zeros(0))[0]
+            return measures(x, s, q, u, w, y, d)[0]
 
-        return deferred(jax.vmap(one, (None, 0, 0, 0, 0)))
+        return deferred(jax.vmap(one, (None, 0, 0, 0, 0, 0)))
 
 
 def _speed(mechanism: Mechanism, driver: str) -> float:

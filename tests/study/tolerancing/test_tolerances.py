@@ -6,8 +6,8 @@ import pytest
 from scipy import stats
 
 import udkjax as udk
-from udkjax.study.tolerancing.dimensions import grade
-from udkjax.study.tolerancing.second_order import quadratic
+from udkjax.synthesis.robust.deviations import grade
+from udkjax.synthesis.robust.second_order import quadratic
 
 SWING = "range(body.rocker.angle)"
 

@@ -18,9 +18,10 @@ from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.numbers.units import read_quantity
 from udkjax.scene.tables.checks import SceneError
 from udkjax.study.tolerancing.cheapest import Limits, common_factor, optimal_scales
-from udkjax.study.tolerancing.dimensions import ToleranceLike, ToleratedNumbers
+from udkjax.study.tolerancing.dimensions import ToleratedNumbers
 from udkjax.study.tolerancing.measures import Measuring, ToleratedMeasures
-from udkjax.study.tolerancing.second_order import Quadratic, quadratic
+from udkjax.synthesis.robust.deviations import ToleranceLike
+from udkjax.synthesis.robust.second_order import Quadratic, quadratic
 from udkjax.wording import quote, suggestion
 
 QUANTILES = (0.001, 0.01, 0.05, 0.5, 0.95, 0.99, 0.999)

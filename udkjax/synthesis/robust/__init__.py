@@ -1,0 +1,1 @@
+"""Goals that hold for most pieces made with tolerances, and the second-order moments behind them."""
