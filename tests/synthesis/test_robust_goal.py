@@ -7,7 +7,7 @@ import udkjax as udk
 from udkjax.positions import gap_in_position
 from udkjax.scene.drawing.drawn_quantities import Units
 from udkjax.synthesis import goal_file
-from udkjax.synthesis.robust.second_order import quadratic
+from udkjax.synthesis.ranges.second_order import quadratic
 
 LINKS = {"crank": ("OA", 10), "coupler": ("ABP", None), "rocker": ("CB", 10)}
 DRAWING = udk.Drawing(

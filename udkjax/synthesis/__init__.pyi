@@ -28,12 +28,12 @@ from udkjax.synthesis.motion_goals import MotionGoal as MotionGoal
 from udkjax.synthesis.motion_goals import MotionPoint as MotionPoint
 from udkjax.synthesis.motion_goals import ToleranceGoal as ToleranceGoal
 from udkjax.synthesis.motion_goals import TorqueGoal as TorqueGoal
-from udkjax.synthesis.robust.deviations import PinClearance as PinClearance
-from udkjax.synthesis.robust.deviations import Tolerance as Tolerance
-from udkjax.synthesis.robust.deviations import ToleranceLike as ToleranceLike
-from udkjax.synthesis.robust.deviations import read_tolerance as read_tolerance
-from udkjax.synthesis.robust.robust_goal import RobustGoal as RobustGoal
-from udkjax.synthesis.robust.second_order import Quadratic as Quadratic
-from udkjax.synthesis.robust.second_order import quadratic as quadratic
+from udkjax.synthesis.ranges.deviations import PinClearance as PinClearance
+from udkjax.synthesis.ranges.deviations import Tolerance as Tolerance
+from udkjax.synthesis.ranges.deviations import ToleranceLike as ToleranceLike
+from udkjax.synthesis.ranges.deviations import read_tolerance as read_tolerance
+from udkjax.synthesis.ranges.second_order import Quadratic as Quadratic
+from udkjax.synthesis.ranges.second_order import quadratic as quadratic
+from udkjax.synthesis.robust_goal import RobustGoal as RobustGoal
 
 __all__: list[str]

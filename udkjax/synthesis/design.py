@@ -21,9 +21,9 @@ from udkjax.scene.tables.checks import SceneError
 from udkjax.synthesis.design_problem import DesignProblem
 from udkjax.synthesis.designs import Designs
 from udkjax.synthesis.goals import Goal, PathGoal
-from udkjax.synthesis.limits import LengthLimits, Range, box_of, read_bounds
 from udkjax.synthesis.motion_goals import MotionTerm
 from udkjax.synthesis.polish import polish
+from udkjax.synthesis.ranges.limits import LengthLimits, Range, box_of, read_bounds
 from udkjax.synthesis.search import SearchState, begin, improve, raise_weights
 from udkjax.synthesis.selection import POLISH_STEPS, select
 from udkjax.synthesis.starts import find_starts

@@ -18,10 +18,10 @@ from udkjax.positions.following.position_batch import compile_programs, position
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.tables.checks import SceneError
 from udkjax.synthesis.goals import Goal, PathGoal, goal_scale, place_of
-from udkjax.synthesis.limits import LEAST_TRANSMISSION, Bounds, LengthLimits
 from udkjax.synthesis.motion_goals import MotionTerm
 from udkjax.synthesis.motion_terms import CompiledTerm
-from udkjax.synthesis.robust.robust_goal import RobustGoal, RobustTerm
+from udkjax.synthesis.ranges.limits import LEAST_TRANSMISSION, Bounds, LengthLimits
+from udkjax.synthesis.robust_goal import RobustGoal, RobustTerm
 from udkjax.synthesis.trials import TrialResiduals, Trials, Turn
 from udkjax.wording import quote
 

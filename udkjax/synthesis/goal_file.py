@@ -20,7 +20,7 @@ from udkjax.synthesis.curves.curve_file import read_curve_file
 from udkjax.synthesis.design import DesignSearch
 from udkjax.synthesis.goals import FunctionGoal, Goal, PathGoal, PoseGoal
 from udkjax.synthesis.motion_goals import EnergyGoal, FrequencyGoal, GapGoal, LoadGoal, MotionTerm, ToleranceGoal, TorqueGoal
-from udkjax.synthesis.robust.robust_goal import RobustGoal
+from udkjax.synthesis.robust_goal import RobustGoal
 from udkjax.wording import plural, quote, unknown_key
 
 TOP = (

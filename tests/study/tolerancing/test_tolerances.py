@@ -6,8 +6,8 @@ import pytest
 from scipy import stats
 
 import udkjax as udk
-from udkjax.synthesis.robust.deviations import grade
-from udkjax.synthesis.robust.second_order import quadratic
+from udkjax.synthesis.ranges.deviations import grade
+from udkjax.synthesis.ranges.second_order import quadratic
 
 SWING = "range(body.rocker.angle)"
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from udkjax.synthesis.robust.second_order import Quadratic
+from udkjax.synthesis.ranges.second_order import Quadratic
 
 SMOOTHING = 0.05  # width of the edges of limits, in standard deviations of the measure
 MOST_SCALE = 100.0  # largest factor of a tolerance: beyond, it does not matter, and the quadratic function does not hold

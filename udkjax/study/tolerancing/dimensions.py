@@ -18,7 +18,7 @@ from udkjax.scene.tables.checks import SceneError
 from udkjax.study.identify.problem.parameters import Parameter, unknowns_of
 from udkjax.study.identify.problem.unknowns import Target, apply_values
 from udkjax.study.identify.records.records import IdentificationError
-from udkjax.synthesis.robust.deviations import PinClearance, Tolerance, ToleranceLike, read_tolerance
+from udkjax.synthesis.ranges.deviations import PinClearance, Tolerance, ToleranceLike, read_tolerance
 from udkjax.wording import quote, suggestion
 
 

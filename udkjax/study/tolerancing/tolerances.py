@@ -20,8 +20,8 @@ from udkjax.scene.tables.checks import SceneError
 from udkjax.study.tolerancing.cheapest import Limits, common_factor, optimal_scales
 from udkjax.study.tolerancing.dimensions import ToleratedNumbers
 from udkjax.study.tolerancing.measures import Measuring, ToleratedMeasures
-from udkjax.synthesis.robust.deviations import ToleranceLike
-from udkjax.synthesis.robust.second_order import Quadratic, quadratic
+from udkjax.synthesis.ranges.deviations import ToleranceLike
+from udkjax.synthesis.ranges.second_order import Quadratic, quadratic
 from udkjax.wording import quote, suggestion
 
 QUANTILES = (0.001, 0.01, 0.05, 0.5, 0.95, 0.99, 0.999)

@@ -30,7 +30,7 @@ from udkjax.synthesis.complete.four_bars import (
 from udkjax.synthesis.complete.motion_check import check_motions
 from udkjax.synthesis.complete.nine_points import find_real_classes
 from udkjax.synthesis.goals import PathGoal, PoseGoal
-from udkjax.synthesis.limits import LengthLimits, Range, read_bounds
+from udkjax.synthesis.ranges.limits import LengthLimits, Range, read_bounds
 
 
 class _Solutions(NamedTuple):

@@ -21,8 +21,8 @@ from udkjax.scene.tables.checks import SceneError
 from udkjax.synthesis.goals import Goal
 from udkjax.synthesis.motion_goals import MotionPoint, MotionTerm, ToleranceGoal
 from udkjax.synthesis.motion_terms import CompiledTerm
-from udkjax.synthesis.robust.deviations import PinClearance, ToleranceLike, read_tolerance
-from udkjax.synthesis.robust.second_order import quadratic
+from udkjax.synthesis.ranges.deviations import PinClearance, ToleranceLike, read_tolerance
+from udkjax.synthesis.ranges.second_order import quadratic
 from udkjax.wording import quote
 
 
