@@ -187,6 +187,7 @@ def test_quadratic_of_a_polynomial():
         ({"link.crank.mass": "h9"}, [SWING], {}, "grade of a length"),
         ({"length(crank)": "h3"}, [SWING], {}, "grades are 5 to 14"),
         ({"Q": udk.PinClearance(1e-4)}, [SWING], {}, "no joint"),
+        ({"pin.C": 1e-3, "length(coupler)": 1e-3}, [SWING], {}, r"pin.C\[0\] changes length\(coupler\)"),
         ({}, [SWING], {}, "none is given"),
         ({"length(crank)": 1e-3}, [], {}, "none is given"),
         ({"length(crank)": 1e-3}, ["spread(body.rocker.angle)"], {}, "of a coordinate or a pin"),

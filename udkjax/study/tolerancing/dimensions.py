@@ -4,7 +4,7 @@ Each number is x = x0 + c + s u: its nominal value, the middle of its limits, it
 with zero mean and unit variance. Numbers that share a source, such as holes of one drill jig, have the same u.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -20,6 +20,11 @@ from udkjax.study.identify.problem.unknowns import Target, apply_values
 from udkjax.study.identify.records.records import IdentificationError
 from udkjax.synthesis.ranges.deviations import PinClearance, Tolerance, ToleranceLike, read_tolerance
 from udkjax.wording import quote, suggestion
+
+# Least change of a number by the deviation of another, relative to its own deviation, that contradicts its tolerance: a share far
+# above rounding errors, and below that to which tolerances are known.
+HIDES = 1e-3
+SHAPE = "pin", "length", "number"  # kinds of numbers of a drawing that may set each other
 
 
 class DeviationSource(NamedTuple):
@@ -40,6 +45,10 @@ class _Play:
     def __call__(self, mechanism: Mechanism, value: Any) -> Mechanism:
         name = f"joint.{self.joint}.points"
         return mechanism.with_parameters({name: jnp.asarray(mechanism.parameters()[name]).at[1, self.axis].add(value)})
+
+
+def _kind(name: str) -> str:
+    return name.partition("(")[0].partition(".")[0]
 
 
 class ToleratedNumbers:
@@ -74,6 +83,24 @@ class ToleratedNumbers:
         table = np.array(rows)
         self.nominal, self.middle, self.sizes = table[:, 0], table[:, 1], table[:, 2]
         self.owners = table[:, 3].astype(int)
+        self._require_independence([name for name in given if not isinstance(given[name], PinClearance) and _kind(name) in SHAPE])
+
+    def _require_independence(self, given: Sequence[str]):
+        """Refuse numbers of which one sets another, such as a pin and a length that ends there: one would hide the other."""
+        if len({_kind(name) for name in given}) <= 1:
+            return  # numbers of one kind are independent
+        read, own = [Parameter(name) for name in given], {name: k for k, name in enumerate(self.names)}
+        names = unknowns_of(self.mechanism, read).names
+        nominal, sizes = (x[[own[name] for name in names]] for x in (self.nominal, self.sizes))
+        problems = []
+        for name in names:
+            k = own[name]
+            moved = apply_values(self.mechanism, [self.targets[k]], jnp.asarray([self.nominal[k] + self.sizes[k]]))
+            changes = np.abs(np.asarray(unknowns_of(moved, read).guess) - nominal)
+            set_by = [other for other, is_moved in zip(names, changes > HIDES * sizes, strict=True) if is_moved and other != name]
+            problems += [f"tolerances: {name} changes {other}, which has a tolerance, too: give one of them" for other in set_by]
+        if problems:
+            raise SceneError(problems, self.mechanism.name)
 
     @property
     def count(self) -> int:
