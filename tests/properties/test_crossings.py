@@ -32,7 +32,7 @@ OTHERS = {
         Outline RoundHole""",
     "errors": "SimulationError AssemblyError SceneError IdentificationError SweepError",
     "studies": """Candidate Parameter Quantity Record Start Axis LatinHypercube Random Sobol Zipped EnergyGoal FrequencyGoal
-        GapGoal FunctionGoal LoadGoal MotionGoal PathGoal PoseGoal RobustGoal ToleranceGoal TorqueGoal Tolerance
+        GapGoal CurveGoal FunctionGoal LoadGoal MotionGoal PathGoal PoseGoal RobustGoal ToleranceGoal TorqueGoal Tolerance
         PinClearance""",
     "bases of classes": "Constraint ForceElement Joint RollingJoint Motion Profile Frame Point Link Drawing Mechanism",
     "tested with all elements": "LiftProfile SwingProfile",
