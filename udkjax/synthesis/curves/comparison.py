@@ -15,9 +15,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from udkjax.synthesis.curves.descent import ALONG
 from udkjax.synthesis.curves.targets import CurveTarget
 
-ALONG = 0.02  # weight of tangential moves in steps, relative to normal ones: it keeps points from sliding for nothing
 TINY = 1e-30  # keeps divisions finite where points of a curve coincide
 
 

@@ -24,7 +24,7 @@ REACH = 50.0  # largest coordinate of a place on its link; joints are limited by
 
 
 class LinkageLimits(NamedTuple):
-    """LinkageLimits of linkages; lengths in RMS radii of the target.
+    """Limits of linkages; lengths in RMS radii of the target.
 
     Attributes:
         cosine: largest cosine of an angle between the links of a dyad.
