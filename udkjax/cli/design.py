@@ -52,7 +52,7 @@ def design(
         curve: file with a curve instead of a goal: rows x, y (.csv), or a drawing with one path (.svg).
         bars: largest number of links for a curve, with the ground.
         size: for a curve, the largest distance of any pin from its middle, in its unit; by default three times its extent.
-        seconds: time after which the search for a curve ends (s).
+        seconds: CPU time after which the search for a curve ends (s).
         unit: unit of the curve and of the drawings.
     """
     for name, value, minimum in (("starts", starts, 1), ("results", results, 1), ("seed", seed, 0)):

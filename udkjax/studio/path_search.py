@@ -11,7 +11,7 @@ from udkjax.studio.text_edits import merge_document, read_document
 from udkjax.synthesis.curves.curve_designs import CurveDesign
 from udkjax.synthesis.curves.mechanisms_for import mechanisms_for
 
-# Largest number of bars, and time (s), of the first search and the following ones: simple mechanisms appear at once.
+# Largest number of bars, and CPU time (s), of the first search and the following ones: simple mechanisms appear at once.
 EFFORTS = ((6, 3.0), (8, 8.0), (10, 16.0), (12, 30.0))
 RESULTS = 4
 FEWEST, MOST = 3, 10_000  # points of a wanted path

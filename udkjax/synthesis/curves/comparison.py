@@ -15,10 +15,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from udkjax.synthesis.curves.descent import ALONG
+from udkjax.synthesis.curves.dyads import TINY
 from udkjax.synthesis.curves.targets import CurveTarget
 
-TINY = 1e-30  # keeps divisions finite where points of a curve coincide
+ALONG = 0.02  # weight of tangential moves within neighbours, relative to normal ones: it keeps points from sliding for nothing
 
 
 class CurveComparison(NamedTuple):

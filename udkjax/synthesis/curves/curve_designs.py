@@ -66,7 +66,7 @@ class CurveDesigns(PrintsTable):
         found: the designs.
         rounds: number of completed rounds; the same seed and number of rounds give the same designs.
         candidates: number of linkages that were improved.
-        seconds: time of the search (s).
+        seconds: CPU time of the search (s).
         reason: why no design was found, and the cure; empty if there are designs.
     """
 
@@ -86,7 +86,7 @@ class CurveDesigns(PrintsTable):
         return iter(self.found)
 
     def _table(self) -> PrintedTable:
-        rows = [("rounds", f"{self.rounds}, {self.candidates} linkages, {self.seconds:.1f} s")]
+        rows = [("rounds", f"{self.rounds}, {self.candidates} linkages, {self.seconds:.1f} s of CPU time")]
         rows += [("nothing was found", self.reason)] if self.reason else []
         for k, design in enumerate(self.found):
             angle = f"{np.degrees(design.transmission):.3g} deg"

@@ -109,7 +109,7 @@ class CurveSearch:
         self.finished: set[float] = set()  # losses of linkages that are finished
         self.found: dict[int, list[FoundLinkage]] = {}
         self.threads = ThreadPoolExecutor(thread_count())
-        self.until = np.inf  # time (`time.monotonic`) at which descents end with an `OutOfTimeError`
+        self.until = np.inf  # CPU time (`time.process_time`) at which descents end with an `OutOfTimeError`
 
     def stages(self) -> Iterator[str]:
         """Run the search, without end; yield a description of each stage when it is completed.
@@ -145,7 +145,7 @@ class CurveSearch:
         self._merge()
         order = sorted((d for d, kept in self.beams.items() if len(kept.x)), key=lambda d: self.beams[d].loss[0])
         for dyads in order:
-            if time.monotonic() < until or not self.found:
+            if time.process_time() < until or not self.found:
                 self._finish(dyads)
         for dyads in order:
             while not self.found and self._finish(dyads):
@@ -185,7 +185,7 @@ class CurveSearch:
 
     def _descend(self, x: np.ndarray, topology: Topology, task: Task, blur: float, steps: int) -> Descended:
         """Improve linkages in batches, on all threads."""
-        if time.monotonic() > self.until:
+        if time.process_time() > self.until:
             raise OutOfTimeError
         self.candidates += len(x)
         batches = [slice(k, k + LANES) for k in range(0, len(x), LANES)]

@@ -1,23 +1,17 @@
 """Levenberg-Marquardt steps of linkages in lanes, towards a small Chamfer distance from a target.
 
-The distance of each point of one curve from the nearest point of the other is split along the normal and the tangent there. The
-tangential part counts only beyond half of the distance of neighbours: past the end of a stroke. Means of distances, not of
-squares, are minimized, by weights 1 / sqrt(d^2 + blur^2); pairs and weights are held within a step.
-
-Source: E. Weiszfeld, "Sur le point pour lequel la somme des distances de n points donnés est minimum", 1937 (weights);
-S. Rusinkiewicz and M. Levoy, "Efficient variants of the ICP algorithm", 2001 (distances along normals).
+The gradient of `comparison` is exact; nearest places and weights are held within a step. Violations of limits are least squares.
 """
 
 from typing import NamedTuple
 
 import numpy as np
 
+from udkjax.synthesis.curves.comparison import compare
 from udkjax.synthesis.curves.dyads import BASE, EACH, HEAD, SPAN, DyadPositions, Topology, gradients, number_count, positions
 from udkjax.synthesis.curves.targets import CurveTarget
 
 FULL_TURN = 2.0 * np.pi
-ALONG = 0.02  # weight of tangential moves within neighbours, relative to normal ones: it keeps points from sliding for nothing
-GAP = 1.5  # half of a gap between points of the linkage's curve that counts as drawn, in mean distances: not a jump
 LONGEST_MOVE = 0.5  # largest change of a number in one step (RMS radii of the target, rad)
 LEAST_SPAN = 0.7  # smallest part of a turn that may draw the curve (rad)
 REACH = 50.0  # largest coordinate of a place on its link; joints are limited by their distance from the target
@@ -92,24 +86,6 @@ class Descended(NamedTuple):
     excess: np.ndarray
 
 
-class _Pairs(NamedTuple):
-    """Distances of points from nearest points: their weights, unit normals, and parts along normals and tangents."""
-
-    weight: np.ndarray
-    normal: np.ndarray
-    across: np.ndarray
-    along: np.ndarray
-
-    def moments(self) -> np.ndarray:
-        """Return xx, xy, yy of the weights, and x, y of the weighted distances (5, K, n)."""
-        x, y, k = np.real(self.normal), np.imag(self.normal), self.weight
-        along = np.where(self.along != 0.0, 1.0, ALONG)
-        pull = k * self.normal * (self.across + 1j * self.along)
-        return np.stack(
-            [k * (x * x + along * y * y), k * (1.0 - along) * x * y, k * (y * y + along * x * x), np.real(pull), np.imag(pull)]
-        )
-
-
 class _Violation(NamedTuple):
     cosines: np.ndarray  # excess of cosines (D, K, T)
     far: np.ndarray  # excess of squared distances of P, Q and R (3, D, K, T)
@@ -128,57 +104,28 @@ def _violation(at: DyadPositions, limits: LinkageLimits) -> _Violation:
     return _Violation(np.maximum(np.abs(at.cosines) - limits.cosine, 0.0), np.maximum(square - 1.0, 0.0))
 
 
-def _compare(c: np.ndarray, task: Task, blur: float) -> tuple[np.ndarray, _Pairs, _Pairs, np.ndarray]:
-    """Return Chamfer distances (K,) of curves (K, N), the pairs of their points and of the target's, and whose are the latter."""
-    target, rows = task.target, np.arange(len(c))[:, None]
-    following, previous = np.roll(c, -1, 1), np.roll(c, 1, 1)
-    if not task.sample.is_whole:
-        following[:, -1], previous[:, 0] = c[:, -1], c[:, 0]
-    chord = following - previous
-    step = np.abs(chord) + 1e-9
-    share = step / step.sum(1, keepdims=True)
-    half = np.minimum(0.25 * step, GAP * 0.5 * step.mean(1, keepdims=True))
-    distance = (np.real(c)[:, :, None] - np.real(target.points)) ** 2
-    distance += (np.imag(c)[:, :, None] - np.imag(target.points)) ** 2
-    near, nearest = distance.argmin(2), distance.argmin(1)
-
-    def pairs(offset, normal, free, share):
-        parts = np.conj(normal) * offset
-        along = np.sign(np.imag(parts)) * np.maximum(np.abs(np.imag(parts)) - free, 0.0)
-        length = np.sqrt(np.real(parts) ** 2 + along**2 + blur**2)
-        return (share * (length - blur)).sum(1), _Pairs(share / length, normal, np.real(parts), along)
-
-    one, of_curve = pairs(c - target.points[near], target.normals[near], target.spread, share)
-    normal = (1j * chord / step)[rows, nearest]
-    even = np.full(nearest.shape, 1.0 / len(target.points))
-    two, of_target = pairs(c[rows, nearest] - target.points, normal, half[rows, nearest], even)
-    return one + two, of_curve, of_target, nearest
-
-
 def evaluate(x: np.ndarray, topology: Topology, task: Task, blur: float) -> tuple[np.ndarray, ...]:
     """Return losses, Chamfer distances and largest violations (K,), and matrices and gradients of the step's equations."""
-    K, sample, limits = len(x), task.sample, task.limits
+    sample, limits = task.sample, task.limits
     at = positions(x, topology, sample.angles(x))
     violation = _violation(at, limits)
     excess = violation.total(limits.weight)
     N = sample.drawing
-    distance, of_curve, of_target, nearest = _compare(at.pin[:, :N], task, blur)
-    place = (np.arange(K)[:, None] * N + nearest).ravel()
-    W = of_curve.moments() + np.stack([np.bincount(place, v.ravel(), K * N).reshape(K, N) for v in of_target.moments()])
+    curve = compare(at.pin[:, :N], task.target, sample.is_whole, blur)
     pushes = (2.0 * limits.weight / limits.size**2) * (violation.far > 0.0) * _joints(at)
     squeeze = limits.weight * (violation.cosines > 0.0) * np.sign(at.cosines)
     J = gradients(x, topology, at, sample.share - sample.rest, pushes[:2], pushes[2], squeeze)
     x_by, y_by = J[:, :, 0, :N], J[:, :, 1, :N]
-    weighted = np.concatenate([W[0][:, None] * x_by + W[1][:, None] * y_by, W[1][:, None] * x_by + W[2][:, None] * y_by], 2)
-    curve = np.concatenate([x_by, y_by], 2)
-    A = curve @ weighted.transpose(0, 2, 1)
-    b = (curve @ np.concatenate([W[3], W[4]], 1)[..., None])[..., 0]
+    xx, xy, yy = (moment[:, None] for moment in curve.moments)
+    by_points = np.concatenate([x_by, y_by], 2)
+    A = by_points @ np.concatenate([xx * x_by + xy * y_by, xy * x_by + yy * y_by], 2).transpose(0, 2, 1)
+    b = (by_points @ np.concatenate([np.real(curve.pull), np.imag(curve.pull)], 1)[..., None])[..., 0]
     active = excess.any(1)
     if active.any():
         beyond = J[active, :, 2]
         A[active] += beyond @ beyond.transpose(0, 2, 1)
         b[active] += (beyond @ excess[active][..., None])[..., 0]
-    return distance + 0.5 * (excess**2).sum(1), distance, excess.max(1) / limits.weight, A, b
+    return curve.distance + 0.5 * (excess**2).sum(1), curve.distance, excess.max(1) / limits.weight, A, b
 
 
 def descend(x: np.ndarray, topology: Topology, task: Task, blur: float, steps: int) -> Descended:

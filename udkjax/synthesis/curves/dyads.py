@@ -16,7 +16,7 @@ import numpy as np
 BASE = 2  # links without dyads
 HEAD, EACH, TAIL = 3, 6, 2  # numbers before the dyads, of each dyad, and after them
 SPAN = 2  # index of the part of the turn
-TINY = 1e-30  # keeps divisions finite where P and Q coincide; such linkages cannot be closed
+TINY = 1e-30  # squared length (RMS radii), far below rounding: keeps divisions finite where two points coincide
 
 
 class Topology(NamedTuple):

@@ -52,10 +52,11 @@ def mechanisms_for(
         size: largest distance (m) of any pin from the middle of the curve, over the whole turn; by default three times the extent
             of the curve.
         results: largest number of designs to return.
-        seconds: time after which the search ends, with the best designs so far (s). It runs until there is a design in any
-            case, some seconds, and ends earlier when the drawn curve is as near as samples of the same curve are to each other.
+        seconds: CPU time of this process, of all its threads, after which the search ends with the best designs so far (s), so
+            that other programs on the same machine do not shorten it. It runs until there is a design in any case, some seconds,
+            and ends earlier when the drawn curve is as near as samples of the same curve are to each other.
         seed: seed of the random linkages. The result follows from the seed and the number of completed stages, which depends on
-            the time; give `rounds`, and enough seconds, for a result that does not.
+            the processor's speed; give `rounds`, and enough seconds, for a result that does not.
         part: "free": an open curve is drawn by any part of the turn; "whole": by the whole turn, forth and back.
         transmission: smallest angle (rad) between the two links of a dyad, and between one and the other prolonged, over the
             whole turn.
@@ -74,11 +75,11 @@ def mechanisms_for(
     require_choice("unit", unit, tuple(Units.sizes("m")))
     wanted = WantedCurve(curve, part == "whole")
     search = CurveSearch(wanted, curve_limits(wanted, size, float(transmission)), _dyads(int(bars)), int(seed))
-    begun = time.monotonic()
+    begun = time.process_time()
     done = _run(search, float(seconds), rounds, begun, progress)
     found = ranked(search.found, wanted, int(results), WORTH, unit)
     reason = "" if found else "no linkage turned within the limits: give more seconds, a larger size or a smaller transmission"
-    return CurveDesigns(tuple(found), done, search.candidates, time.monotonic() - begun, reason)
+    return CurveDesigns(tuple(found), done, search.candidates, time.process_time() - begun, reason)
 
 
 def _run(search: CurveSearch, seconds: float, rounds: int | None, begun: float, progress: ProgressOption) -> int:
@@ -91,12 +92,12 @@ def _run(search: CurveSearch, seconds: float, rounds: int | None, begun: float, 
                     search.finish()
                 search.until = begun + GROWING * seconds if search.found or done else np.inf
                 error = f", error {search.best:.4g}" if np.isfinite(search.best) else ""
-                report(min(time.monotonic() - begun, seconds), stage + error)
+                report(min(time.process_time() - begun, seconds), stage + error)
                 if stage.endswith("finished"):
                     done += 1
                     if search.best <= enough or done == rounds:
                         return done
-                if time.monotonic() > search.until:
+                if time.process_time() > search.until:
                     break
     except (KeyboardInterrupt, OutOfTimeError):
         pass

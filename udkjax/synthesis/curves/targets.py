@@ -69,15 +69,11 @@ class CurveTarget(NamedTuple):
 
     Attributes:
         points: complex points at equal arc lengths (M,).
-        normals: complex unit normals at these points (M,).
-        spread: half of the distance of neighbours.
         following: the next point of each (M,); that of an open curve's last point is this point.
         previous: the previous point of each (M,); that of an open curve's first point is this point.
     """
 
     points: np.ndarray
-    normals: np.ndarray
-    spread: float
     following: np.ndarray
     previous: np.ndarray
 
@@ -108,10 +104,7 @@ class WantedCurve:
         following, previous = np.roll(z, -1), np.roll(z, 1)
         if not self.is_closed:
             following[-1], previous[0] = z[-1], z[0]
-        chord = following - previous
-        chord = np.where(np.abs(chord) < 1e-9, following - z, chord)  # where the curve turns back
-        chord = np.where(np.abs(chord) < 1e-12, 1.0, chord)
-        return CurveTarget(z, 1j * chord / np.abs(chord), 0.5 * self.length / count, following, previous)
+        return CurveTarget(z, following, previous)
 
     def error(self, pin: np.ndarray) -> float:
         """Return the Chamfer distance of a path (complex, normalized), of which whole turns are closed, from the curve."""

@@ -1,0 +1,113 @@
+"""Searches for the mechanisms of curves, by the public function and by BFGS, and independent checks of what they found."""
+
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.optimize import minimize
+
+import udkjax as udk
+from udkjax.synthesis.curves.curve_designs import CurveDesign
+from udkjax.synthesis.curves.curve_search import CurveSearch
+from udkjax.synthesis.curves.descent import Task, evaluate
+from udkjax.synthesis.curves.dyads import Topology
+from udkjax.synthesis.curves.matching import find_starts
+from udkjax.synthesis.curves.mechanisms_for import SIZE, TRANSMISSION, curve_limits
+from udkjax.synthesis.curves.targets import WantedCurve
+
+BARS = (4, 6, 8, 10, 12)
+MOST_RESULTS = 25  # designs of a search: with each number of bars
+PATH, SEGMENTS = 240, 60  # numbers in the data of a curve
+TIMES = 40  # progress reports of a search
+STARTS, STEPS = 300, 100  # of BFGS: random linkages, and steps with each of two blurs
+Result = dict[str, Any]
+
+
+def stored(folder: Path | None, name: str, compute: Callable[[], Result]) -> Result:
+    """Return a result from a folder; compute and write it if it is not there. Without a folder, compute it."""
+    file = None if folder is None else folder / f"{name}.json"
+    if file is not None and file.exists():
+        return json.loads(file.read_text(encoding="utf-8"))
+    result = compute()
+    if file is not None:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        part = file.with_suffix(".part")
+        part.write_text(json.dumps(result), encoding="utf-8")
+        part.replace(file)
+    return result
+
+
+def search(curve: np.ndarray, seconds: float, seed: int = 0) -> Result:
+    """Return what `udk.mechanisms_for` finds by default within CPU seconds, each design checked."""
+    reports: list[tuple[float, float]] = []
+    begun = time.process_time()
+
+    def note(progress: Any) -> None:
+        _, said, error = progress.message.rpartition("error ")
+        if said:
+            reports.append((time.process_time() - begun, float(error)))
+
+    found = udk.mechanisms_for(curve, seconds=seconds, seed=seed, results=MOST_RESULTS, progress=note)
+    spent, best = time.process_time() - begun, min(found, key=lambda one: one.error)
+    errors = [min((one.error for one in found if one.bars <= bars), default=np.inf) for bars in BARS]
+    reports = [*reports[-TIMES + 1 :], (spent, best.error)]
+    path = best.curve[np.linspace(0, len(best.curve) - 1, PATH).astype(int)]
+    given = {"error": errors, "bars": best.bars, "seconds": spent, "rounds": found.rounds, "reports": reports}
+    return given | check(best, curve) | {"path": path.tolist(), "links": _links(best)}
+
+
+def check(design: CurveDesign, curve: np.ndarray) -> Result:
+    """Return, from `kinematics` alone, how far loops are open, how large the mechanism is, and where its pin goes.
+
+    `turned`: all 720 positions are reached, with the transmission angle's limit. `off`: the largest distance of the pin's path
+    over the part of the turn that draws the curve from the returned curve, relative to the wanted curve's extent: another branch
+    would draw another one.
+    """
+    wanted, mechanism = WantedCurve(curve), design.mechanism
+    motion = design.motion(721)
+    gap = max(np.abs(np.asarray(udk.equations.psi(mechanism, 0.0, q)))[:-1].max() for q in np.asarray(motion.q))
+    pins = np.stack([np.asarray(udk.path(mechanism, motion, pin)) for pin in design.pins])
+    middle = np.array([wanted.middle.real, wanted.middle.imag])
+    size = float(np.linalg.norm(pins - middle, axis=-1).max())
+    part = udk.kinematics(mechanism, design.driver, np.linspace(*design.values, len(design.curve)))
+    off = np.abs(np.asarray(udk.path(mechanism, part, design.pin)) - design.curve).max()
+    return {
+        "turned": bool(np.asarray(motion.reached).all()) and design.transmission > TRANSMISSION,
+        "open": float(gap / (size + np.linalg.norm(middle))),
+        "size": size / (SIZE * wanted.extent),
+        "off": float(off / wanted.extent),
+    }
+
+
+def _links(design: CurveDesign) -> list[list[list[float]]]:
+    """Return segments from the first pin of each link to its others, as drawn (m)."""
+    pins = {name: np.asarray(place).tolist() for name, place in design.pins.items()}
+    links = design.drawing.links.values() if design.drawing else ()
+    return [[pins[link.pins[0]], pins[name]] for link in links for name in link.pins[1:]][:SEGMENTS]
+
+
+def by_bfgs(curve: np.ndarray, seconds: float, dyads: int, seed: int) -> Result:
+    """Return the least error of random linkages that BFGS improves one after another for CPU seconds."""
+    wanted = WantedCurve(curve)
+    one_by_one = CurveSearch(wanted, curve_limits(wanted, None, TRANSMISSION), dyads, seed)
+    begun, best = time.process_time(), np.inf
+    starts, topology = find_starts(wanted, one_by_one.limits, dyads, STARTS, STARTS, np.random.default_rng(seed))
+    low, high = one_by_one.limits.bounds(dyads, wanted.is_whole)
+
+    def loss(y: np.ndarray, topology: Topology, task: Task, blur: float) -> tuple[float, np.ndarray]:
+        value, _, _, _, slope = evaluate(np.clip(y, low, high)[None], topology, task, blur)
+        return float(value[0]), slope[0]
+
+    for k in range(len(starts)):
+        one, x = topology.take(slice(k, k + 1)), starts[k]
+        for blur, weight in ((0.05, 10.0), (0.01, 100.0)):
+            given = (one, one_by_one.coarse.weighed(weight), blur)
+            x = np.clip(minimize(loss, x, given, jac=True, method="BFGS", options={"maxiter": STEPS}).x, low, high)
+        found = one_by_one.verified(x, one)
+        best = best if found is None else min(best, found.error)
+        if time.process_time() - begun > seconds:
+            break
+    return {"error": best, "seconds": time.process_time() - begun}
