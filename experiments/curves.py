@@ -27,7 +27,6 @@ from udkjax.synthesis.curves.mechanisms_for import TRANSMISSION
 SEEDED = "KRAEX"  # letters that are searched with several seeds
 SECONDS = 10.0  # of CPU time, of each search: a sixth of the default
 MET, MEAN, SHARE = 0.005, 0.02, 0.9
-DYADS = (BARS[-1] - 2) // 2
 KEPT = HERE / "data" / ".curves"  # results of an interrupted study
 SAME_PATH = 1e-9  # largest distance of the path by `kinematics` from the returned curve, relative to the curve's extent
 
@@ -42,7 +41,7 @@ def study(smoke: bool, seconds: float = SECONDS, classics: int = 10, seeds: int 
         for name, curve in tracked(curves.items(), "curves")
     }
     plain = {
-        name: stored(folder, f"bfgs {name}", lambda name=name: by_bfgs(letter(name), found[name]["seconds"], DYADS, 0))
+        name: stored(folder, f"bfgs {name}", lambda name=name: by_bfgs(letter(name), found[name]["seconds"], BARS[-1], 0))
         for name in tracked(letters, "BFGS")
     }
     runs = [(name, seed) for name in seeded for seed in range(1, seeds)]

@@ -89,11 +89,11 @@ def _links(design: CurveDesign) -> list[list[list[float]]]:
     return [[pins[link.pins[0]], pins[name]] for link in links for name in link.pins[1:]][:SEGMENTS]
 
 
-def by_bfgs(curve: np.ndarray, seconds: float, dyads: int, seed: int) -> Result:
+def by_bfgs(curve: np.ndarray, seconds: float, bars: int, seed: int) -> Result:
     """Return the least error of random linkages that BFGS improves one after another for CPU seconds."""
     wanted = WantedCurve(curve)
-    one_by_one = CurveSearch(wanted, curve_limits(wanted, None, TRANSMISSION), dyads, seed)
-    begun, best = time.process_time(), np.inf
+    one_by_one = CurveSearch(wanted, curve_limits(wanted, None, TRANSMISSION), bars, seed)
+    begun, best, dyads = time.process_time(), np.inf, (bars - 2) // 2
     starts, topology = find_starts(wanted, one_by_one.limits, dyads, STARTS, STARTS, np.random.default_rng(seed))
     low, high = one_by_one.limits.bounds(dyads, wanted.is_whole)
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 from udkjax.synthesis.curves.curve_file import points_of_path
-from udkjax.synthesis.curves.dyads import BASE, EACH, HEAD, Topology, number_count, positions
+from udkjax.synthesis.curves.dyads import BASE, EACH, HEAD, SECOND, Topology, number_count, positions
 
 LETTERS = {
     "A": "M0 6 L2 0 L4 6 L3.2 3.6 H0.8",
@@ -67,13 +67,14 @@ def curves_of_mechanisms(count: int, rng: np.random.Generator) -> list[np.ndarra
     theta = np.linspace(0.0, 2.0 * np.pi, 361)[None]
     while len(curves) < count:
         dyads = 1 + len(curves) % 3
-        x, links = rng.uniform(-2.0, 2.0, (1, number_count(dyads))), BASE + 2 * np.arange(dyads)
+        second_crank, links = np.arange(SECOND, HEAD), BASE + 2 * np.arange(dyads)
+        x = np.insert(rng.uniform(-2.0, 2.0, number_count(dyads) - len(second_crank)), [SECOND] * len(second_crank), 0.0)[None]
         x[0, HEAD : HEAD + 2] = rng.uniform(0.3, 1.0), 0.0
         for k in HEAD + EACH * np.arange(dyads):
             x[0, k + 4 : k + 6] = rng.uniform(0.7, 3.0, 2)
         first = np.array([[1, *(links[1:] - rng.integers(1, 3, dyads - 1))]])
         second = np.where(rng.random((1, dyads)) < 0.5, 0, np.maximum(first - 2, 0) * (first > BASE + 1))
-        at = positions(x, Topology(first, second, rng.choice([-1.0, 1.0], (1, dyads))), theta, 0.0)
+        at = positions(x, Topology(first, second, rng.choice([-1.0, 1.0], (1, dyads)), np.zeros(1, int)), theta, 0.0)
         if np.abs(at.cosines).max() < np.cos(np.deg2rad(10.0)) and np.ptp(at.pin.real) > 0.1:
             curves.append(_points(at.pin[0, :-1]))
     return curves

@@ -6,21 +6,22 @@ import pytest
 import udkjax as udk
 from udkjax.synthesis.curves.curve_search import CurveSearch, OutOfTimeError
 from udkjax.synthesis.curves.descent import LinkageLimits
-from udkjax.synthesis.curves.dyads import EACH, HEAD, SPAN, Topology, gradients, number_count, positions
+from udkjax.synthesis.curves.dyads import BASE, EACH, HEAD, SPAN, Topology, gradients, number_count, positions
 from udkjax.synthesis.curves.random_linkages import random_linkages, turn_angles
 from udkjax.synthesis.curves.targets import WantedCurve, as_points, chamfer
 
 ELLIPSE = np.array([[3.0 + 0.2 * np.cos(t), 1.0 + 0.1 * np.sin(t)] for t in np.linspace(0.0, 2.0 * np.pi, 40)])
 
 
-def test_derivatives_of_linkages_are_those_of_their_positions():
-    x, topology = random_linkages(12, 3, np.random.default_rng(0))
+@pytest.mark.parametrize("geared", [False, True])
+def test_derivatives_of_linkages_are_those_of_their_positions(geared):
+    x, topology = random_linkages(12, 3, np.random.default_rng(0), geared)
     share = np.arange(20) / 20
     x[:, SPAN] = 5.0
 
     def measures(y):
         at = positions(y, topology, y[:, SPAN, None] * share)
-        joints = np.stack([at.origins[2::2], at.origins[3::2], at.ends])
+        joints = np.stack([at.origins[BASE::2], at.origins[BASE + 1 :: 2], at.ends])
         third = np.sum(at.cosines**2, 0) + np.sum(np.abs(joints) ** 2, (0, 1))
         return at, joints, np.stack([at.pin.real, at.pin.imag, third], 1)
 
@@ -35,17 +36,18 @@ def test_derivatives_of_linkages_are_those_of_their_positions():
         assert np.where(is_closed, error, 0.0).max() < 1e-6
 
 
-def test_random_linkages_close_over_the_whole_turn():
-    x, topology = random_linkages(200, 3, np.random.default_rng(1))
+@pytest.mark.parametrize("geared", [False, True])
+def test_random_linkages_close_over_the_whole_turn(geared):
+    x, topology = random_linkages(200, 3, np.random.default_rng(1), geared)
     assert np.abs(positions(x, topology, turn_angles(200)).cosines).max() < 1.0
 
 
 def test_a_four_bar_has_the_positions_of_the_drawing():
     x = np.zeros((1, number_count(1)))
     x[0, HEAD : HEAD + EACH], x[0, -2:] = [1.0, 0.0, 3.0, 0.0, 2.5, 2.0], [1.0, 0.5]
-    topology = Topology(np.array([[1]]), np.array([[0]]), np.array([[1.0]]))
+    topology = Topology(np.array([[1]]), np.array([[0]]), np.array([[1.0]]), np.array([0]))
     at = positions(x, topology, np.array([[0.0, 1.0]]))
-    P, R, Q = at.origins[2, 0], at.ends[0, 0], at.origins[3, 0]
+    P, R, Q = at.origins[BASE, 0], at.ends[0, 0], at.origins[BASE + 1, 0]
     np.testing.assert_allclose(np.abs(R - P), 2.5, rtol=1e-12)
     np.testing.assert_allclose(np.abs(R - Q), 2.0, rtol=1e-12)
     np.testing.assert_allclose(P, np.exp(1j * np.array([0.0, 1.0])), rtol=1e-12)
@@ -108,10 +110,10 @@ def test_a_curve_of_any_size_is_drawn():
 
 def test_linkages_that_end_at_a_limit_are_kept():
     wanted = WantedCurve([[0, 6], [0, 0], [4, 0]])
-    search = CurveSearch(wanted, LinkageLimits(np.cos(np.deg2rad(25.0)), 3.0, 0.1), 2, seed=0)
+    search = CurveSearch(wanted, LinkageLimits(np.cos(np.deg2rad(25.0)), 3.0, 0.1), 6, seed=0)
     stages = search.stages()
     next(stages), next(stages)
-    best = search.fresh[2]
+    best = search.fresh[6]
     assert len(best.x) >= 4
     at = positions(best.x, best.topology, turn_angles(len(best.x)), 0.0)
     cosine = np.abs(at.cosines).max((0, 2))
@@ -157,12 +159,12 @@ def test_an_interruption_ends_with_the_best_so_far():
 
 
 def test_a_search_ends_in_the_middle_of_a_stage():
-    search = CurveSearch(WantedCurve(ELLIPSE), LinkageLimits(0.98, 10.0, 0.02), 2, seed=0)
+    search = CurveSearch(WantedCurve(ELLIPSE), LinkageLimits(0.98, 10.0, 0.02), 6, seed=0)
     next(search.stages())
     search.until = 0.0
-    for interrupted in (lambda: search._grow(search.fresh, 1, np.random.default_rng(0)), search.finish):
+    for interrupted in (lambda: search._grow(search.fresh, 4, np.random.default_rng(0)), search.finish):
         with pytest.raises(OutOfTimeError):
             interrupted()
     search.until = np.inf
     search.finish(0.0)
-    assert 0.0 < search.best < 0.1 and set(search.found) == {1}
+    assert 0.0 < search.best < 0.1 and set(search.found) == {4}

@@ -109,7 +109,7 @@ def confirmed(found: FoundLinkage, wanted: WantedCurve, name: str, unit: str) ->
         mechanism=mechanism,
         pin=PIN,
         curve=as_points(path),
-        bars=2 + 2 * found.dyads,
+        bars=found.bars,
         size=size,
         transmission=float(np.arcsin(found.sine)),
         values=start + np.array([0.0, found.x[SPAN]]),
@@ -119,12 +119,12 @@ def confirmed(found: FoundLinkage, wanted: WantedCurve, name: str, unit: str) ->
 
 
 def ranked(found: dict[int, list[FoundLinkage]], wanted: WantedCurve, count: int, worth: float, unit: str) -> list[CurveDesign]:
-    """Return the best different designs by error and simplicity: each dyad more must reduce the error by the fraction `worth`."""
-    every = sorted((one for of_size in found.values() for one in of_size), key=lambda one: one.error / (1.0 - worth) ** one.dyads)
+    """Return the best different designs by error and simplicity: two more bars must reduce the error by the fraction `worth`."""
+    every = sorted((one for same in found.values() for one in same), key=lambda one: one.error / (1.0 - worth) ** (one.bars / 2))
     chosen: list[CurveDesign] = []
     errors: list[tuple[bytes, float]] = []
     for one in every:
-        structure = one.topology.first.tobytes() + one.topology.second.tobytes()
+        structure = one.topology.first.tobytes() + one.topology.second.tobytes() + one.topology.ratio.tobytes()
         if len(chosen) == count or any(s == structure and abs(e - one.error) < 0.02 * e for s, e in errors):
             continue
         design = confirmed(one, wanted, f"curve {len(chosen) + 1}", unit)

@@ -8,12 +8,13 @@ from typing import NamedTuple
 import numpy as np
 
 from udkjax.synthesis.curves.descent import Descended, LinkageLimits, Task, descend, sampling
-from udkjax.synthesis.curves.dyads import BASE, EACH, HEAD, SPAN, TAIL, Topology, positions
+from udkjax.synthesis.curves.dyads import BASE, EACH, GEARED, HEAD, SPAN, TAIL, Topology, positions
 from udkjax.synthesis.curves.matching import find_starts
 from udkjax.synthesis.curves.random_linkages import grown
 from udkjax.synthesis.curves.targets import WantedCurve
 from udkjax.threads import thread_count
 
+FEWEST_BARS = 4
 LANES = 16  # linkages of a batch: their numbers stay in the cache
 SAMPLES = 6000  # random linkages of a stage
 START_DYADS = 3  # most dyads of random linkages; with more, few random curves resemble the target
@@ -30,7 +31,7 @@ CHECKED = 1440  # angles of a turn at which limits are verified
 
 
 class Kept(NamedTuple):
-    """Linkages of the same number of dyads with their losses, and the starts from which they come."""
+    """Linkages of the same number of bars with their losses, and the starts from which they come."""
 
     x: np.ndarray
     topology: Topology
@@ -83,9 +84,9 @@ class FoundLinkage(NamedTuple):
     size: float
 
     @property
-    def dyads(self) -> int:
-        """The number of dyads that the drawing pin needs."""
-        return self.topology.dyads
+    def bars(self) -> int:
+        """The number of links, with the ground, that the drawing pin needs."""
+        return FEWEST_BARS + 2 * (self.topology.dyads - 1) + int(self.topology.ratio[0] != 0)
 
 
 class CurveSearch:
@@ -94,17 +95,17 @@ class CurveSearch:
     Args:
         wanted: the wanted curve.
         limits: the limits.
-        dyads: the largest number of dyads.
+        bars: the largest number of links, with the ground.
         seed: seed of all random numbers.
     """
 
-    def __init__(self, wanted: WantedCurve, limits: LinkageLimits, dyads: int, seed: int):
-        self.wanted, self.limits, self.dyads = wanted, limits, dyads
+    def __init__(self, wanted: WantedCurve, limits: LinkageLimits, bars: int, seed: int):
+        self.wanted, self.limits, self.bars = wanted, limits, bars
         self.seed, self.families, self.candidates = seed, 0, 0
         inner = limits._replace(cosine=limits.cosine - 2 * SLACK, size=limits.size * (1.0 - 2 * SLACK))
         self.coarse = Task(wanted.target(96), sampling(64, 32, wanted.is_whole), inner)
         self.exact = Task(wanted.target(240), sampling(192, 64, wanted.is_whole), inner)
-        self.beams: dict[int, Kept] = {}  # of all rounds, by the number of dyads
+        self.beams: dict[int, Kept] = {}  # of all rounds, by the number of bars; an odd one if there is a second crank
         self.fresh: dict[int, Kept] = {}  # of this round
         self.finished: set[float] = set()  # losses of linkages that are finished
         self.found: dict[int, list[FoundLinkage]] = {}
@@ -115,18 +116,20 @@ class CurveSearch:
         """Run the search, without end; yield a description of each stage when it is completed.
 
         A round begins anew, since what grows best is not known from its start; then the best linkages of all rounds grow again.
+        Every second round begins with two geared cranks.
         """
         done = 0
         while True:
             rng = np.random.default_rng((self.seed, done))
             self.fresh = fresh = {}
-            for dyads in range(1, min(START_DYADS, self.dyads) + 1):
-                self._start(fresh, dyads, rng)
-                yield f"round {done + 1}: random linkages of {2 + 2 * dyads} bars"
+            fewest = FEWEST_BARS + (done % 2 if self.bars > FEWEST_BARS else 0)
+            for bars in range(fewest, min(fewest + 2 * START_DYADS, self.bars + 1), 2):
+                self._start(fresh, bars, rng)
+                yield f"round {done + 1}: random linkages of {bars} bars"
             for beams in (fresh, self.beams)[: 2 if done else 1]:
-                for dyads in range(1, self.dyads):
-                    self._grow(beams, dyads, rng)
-                    yield f"round {done + 1}: linkages of {4 + 2 * dyads} bars"
+                for bars in range(fewest, self.bars - 1, 2):
+                    self._grow(beams, bars, rng)
+                    yield f"round {done + 1}: linkages of {bars + 2} bars"
                 self._merge()
             self.finish()
             done += 1
@@ -143,36 +146,37 @@ class CurveSearch:
         While none is within the limits, the next ones are tried.
         """
         self._merge()
-        order = sorted((d for d, kept in self.beams.items() if len(kept.x)), key=lambda d: self.beams[d].loss[0])
-        for dyads in order:
+        order = sorted((n for n, kept in self.beams.items() if len(kept.x)), key=lambda n: self.beams[n].loss[0])
+        for bars in order:
             if time.process_time() < until or not self.found:
-                self._finish(dyads)
-        for dyads in order:
-            while not self.found and self._finish(dyads):
+                self._finish(bars)
+        for bars in order:
+            while not self.found and self._finish(bars):
                 pass
 
-    def _start(self, beams: dict[int, Kept], dyads: int, rng: np.random.Generator) -> None:
-        x, topology = find_starts(self.wanted, self.limits, dyads, SAMPLES, 2 * OF_STARTS[0][3], rng)
+    def _start(self, beams: dict[int, Kept], bars: int, rng: np.random.Generator) -> None:
+        dyads, geared = divmod(bars - 2, 2)
+        x, topology = find_starts(self.wanted, self.limits, dyads, SAMPLES, 2 * OF_STARTS[0][3], rng, bool(geared))
         family = self.families + np.arange(len(x))
         self.families += len(x)
         if len(x):
-            self._keep(beams, dyads, self._improve(Kept(x, topology, np.zeros(len(x)), family), OF_STARTS))
+            self._keep(beams, bars, self._improve(Kept(x, topology, np.zeros(len(x)), family), OF_STARTS))
 
-    def _grow(self, beams: dict[int, Kept], dyads: int, rng: np.random.Generator) -> None:
-        if dyads not in beams or not len(beams[dyads].x):
+    def _grow(self, beams: dict[int, Kept], bars: int, rng: np.random.Generator) -> None:
+        if bars not in beams or not len(beams[bars].x):
             return
-        parents = beams[dyads]
+        parents = beams[bars]
         x, topology = grown((parents.x, parents.topology), self.coarse.target, self.coarse.sample, TRIES, CHILDREN, rng)
         children = Kept(x, topology, np.zeros(len(x)), np.repeat(parents.family, CHILDREN))
-        self._keep(beams, dyads + 1, self._improve(children, OF_GROWTH))
+        self._keep(beams, bars + 2, self._improve(children, OF_GROWTH))
 
-    def _keep(self, beams: dict[int, Kept], dyads: int, kept: Kept) -> None:
-        beams[dyads] = kept.with_others(beams.get(dyads)).best(BEAM, FAMILY)
+    def _keep(self, beams: dict[int, Kept], bars: int, kept: Kept) -> None:
+        beams[bars] = kept.with_others(beams.get(bars)).best(BEAM, FAMILY)
 
     def _merge(self) -> None:
         """Add the linkages of this round to those of all rounds."""
-        for dyads, kept in self.fresh.items():
-            self._keep(self.beams, dyads, kept)
+        for bars, kept in self.fresh.items():
+            self._keep(self.beams, bars, kept)
 
     def _improve(self, kept: Kept, parts: tuple[tuple[float, float, int, int], ...]) -> Kept:
         for part in parts:
@@ -192,9 +196,9 @@ class CurveSearch:
         results = list(self.threads.map(lambda part: descend(x[part], topology.take(part), task, blur, steps), batches))
         return Descended(*(np.concatenate(a) for a in zip(*results, strict=True)))
 
-    def _finish(self, dyads: int) -> bool:
-        """Finish the best linkages of a number of dyads, or the next ones if there is no result; return False if all are."""
-        kept = self.beams[dyads]
+    def _finish(self, bars: int) -> bool:
+        """Finish the best linkages of a number of bars, or the next ones if there is no result; return False if all are."""
+        kept = self.beams[bars]
         new = [k for k, loss in enumerate(kept.loss) if loss not in self.finished and (k < FINISHED or not self.found)]
         new = new[:FINISHED]
         if not new:
@@ -207,13 +211,13 @@ class CurveSearch:
         for k in range(len(x)):
             one = self.verified(*without_idle_dyads(x[k], kept.topology.take(slice(k, k + 1))))
             if one is not None:
-                self.found[one.dyads] = sorted([*self.found.get(one.dyads, []), one], key=lambda f: f.error)[:BEAM]
+                self.found[one.bars] = sorted([*self.found.get(one.bars, []), one], key=lambda f: f.error)[:BEAM]
         return True
 
     def verified(self, x: np.ndarray, topology: Topology) -> FoundLinkage | None:
         """Return the linkage if it is within the limits over the whole turn."""
         at = positions(x[None], topology, np.arange(CHECKED)[None] * (2 * np.pi / CHECKED), 0.0)
-        joints = np.concatenate([at.origins[BASE:], at.ends, at.origins[1:2], at.pin[None]])
+        joints = np.concatenate([at.origins[1:] if topology.ratio[0] else np.delete(at.origins[1:], GEARED - 1, 0), at.ends, at.pin[None]])
         cosine, size = float(np.abs(at.cosines).max()), float(np.abs(joints).max())
         if not (cosine <= self.limits.cosine and size <= self.limits.size):
             return None
@@ -239,5 +243,7 @@ def without_idle_dyads(x: np.ndarray, topology: Topology) -> tuple[np.ndarray, T
     for new, old in enumerate(dyads):
         number[BASE + 2 * old : BASE + 2 * old + 2] = BASE + 2 * new, BASE + 2 * new + 1
     parts = [x[:HEAD], *(x[HEAD + EACH * d : HEAD + EACH * (d + 1)] for d in dyads), x[-TAIL:]]
-    chosen = Topology(number[topology.first[:, dyads]], number[topology.second[:, dyads]], topology.side[:, dyads])
+    first, second = number[topology.first[:, dyads]], number[topology.second[:, dyads]]
+    ratio = topology.ratio * ((first == GEARED) | (second == GEARED)).any()
+    chosen = Topology(first, second, topology.side[:, dyads], ratio)
     return np.concatenate(parts), chosen

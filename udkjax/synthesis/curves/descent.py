@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from udkjax.synthesis.curves.comparison import compare
-from udkjax.synthesis.curves.dyads import BASE, EACH, HEAD, SPAN, DyadPositions, Topology, gradients, number_count, positions
+from udkjax.synthesis.curves.dyads import BASE, EACH, HEAD, PHASE, SPAN, DyadPositions, Topology, gradients, number_count, positions
 from udkjax.synthesis.curves.targets import CurveTarget
 
 FULL_TURN = 2.0 * np.pi
@@ -36,6 +36,7 @@ class LinkageLimits(NamedTuple):
         """Return the lower and upper bounds of the numbers of a linkage."""
         high = np.full(number_count(dyads), REACH)
         low = -high
+        low[PHASE], high[PHASE] = -np.inf, np.inf
         low[SPAN], high[SPAN] = FULL_TURN if is_whole else LEAST_SPAN, FULL_TURN
         for d in range(dyads):
             low[HEAD + EACH * d + 4 : HEAD + EACH * d + 6] = self.shortest

@@ -1,10 +1,11 @@
 """Linkages of dyads in lanes: every position by an intersection of circles, derivatives by statics.
 
-Link 0 is the ground, link 1 the crank. Dyad d adds the links 2 + 2 d, from its joint P on one link to its joint R, and 3 + 2 d,
-from its joint Q on another link to R. The drawing pin is a
+Link 0 is the ground, link 1 the crank, link 2 a second crank that turns `ratio` times as fast, by gears or a belt. Dyad d adds the
+links 3 + 2 d, from its joint P on one link to its joint R, and 4 + 2 d, from its joint Q on another link to R. The drawing pin is a
 point of the last dyad's first link. The frame of a link has its origin at O, P or Q, and its x axis points to R.
 
-The numbers x of a linkage are: the place of O (2), the part of the turn that draws the curve (rad), for each dyad the places of P
+The numbers x of a linkage are: the place of O (2), the part of the turn that draws the curve (rad), the pivot of the second crank
+(2) and its angle at the beginning (rad), for each dyad the places of P
 and Q on their links (4) and the lengths P-R and Q-R (2), and the place of the drawing pin on its link (2). Places are complex
 numbers.
 """
@@ -13,9 +14,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-BASE = 2  # links without dyads
-HEAD, EACH, TAIL = 3, 6, 2  # numbers before the dyads, of each dyad, and after them
-SPAN = 2  # index of the part of the turn
+BASE = 3  # links without dyads
+HEAD, EACH, TAIL = 6, 6, 2  # numbers before the dyads, of each dyad, and after them
+SPAN, SECOND, PHASE = 2, 3, 5  # indices of the part of the turn, and of the second crank's pivot and angle
+GEARED = 2  # number of the second crank
 TINY = 1e-30  # squared length (RMS radii), far below rounding: keeps divisions finite where two points coincide
 
 
@@ -26,11 +28,13 @@ class Topology(NamedTuple):
         first: number of the link that carries P (K, D).
         second: number of the link that carries Q (K, D).
         side: 1 or -1, the side of P-Q on which R is (K, D).
+        ratio: turns of the second crank for one of the crank, a whole number; 0 if there is none (K,).
     """
 
     first: np.ndarray
     second: np.ndarray
     side: np.ndarray
+    ratio: np.ndarray
 
     def take(self, which: Any) -> "Topology":
         """Return some of the linkages."""
@@ -78,6 +82,8 @@ def positions(x: np.ndarray, topology: Topology, theta: np.ndarray, least: float
     z, u = np.zeros((BASE + 2 * D, K, T), complex), np.ones((BASE + 2 * D, K, T), complex)
     ends, cosines, lanes = np.empty((D, K, T), complex), np.empty((D, K, T)), np.arange(K)
     z[1], u[1] = _complex(x, 0), np.exp(1j * theta)
+    if topology.ratio.any():
+        z[GEARED], u[GEARED] = _complex(x, SECOND), np.exp(1j * (topology.ratio[:, None] * theta + x[:, PHASE, None]))
     for d in range(D):
         k = HEAD + EACH * d
         A, B = topology.first[:, d], topology.second[:, d]
@@ -168,7 +174,9 @@ def gradients(
         at_second[:, 2] += pulls[1, d] + of_way
         load(topology.first[:, d], P, at_first, k)
         load(topology.second[:, d], Q, at_second, k + 2)
-    result[:, 0] += np.real(force[1])
-    result[:, 1] += np.imag(force[1])
-    result[:, SPAN] += moment[1] * share
+    for k, crank in ((0, 1), (SECOND, GEARED)):
+        result[:, k] += np.real(force[crank])
+        result[:, k + 1] += np.imag(force[crank])
+    result[:, PHASE] += moment[GEARED]
+    result[:, SPAN] += (moment[1] + topology.ratio[:, None, None] * moment[GEARED]) * share
     return result

@@ -10,7 +10,7 @@ from udkjax.positions.following.kinematics import FULL_TURN
 from udkjax.scene.drawing import Drawing
 from udkjax.scene.drawing.drawn_quantities import Units
 from udkjax.scene.mechanism import Mechanism
-from udkjax.synthesis.curves.dyads import BASE, EACH, HEAD, TAIL, Topology, positions
+from udkjax.synthesis.curves.dyads import BASE, EACH, GEARED, HEAD, SECOND, TAIL, Topology, positions
 from udkjax.synthesis.curves.targets import WantedCurve
 
 PIN = "P"  # name of the drawing pin
@@ -18,6 +18,7 @@ TURN_VALUES = 720  # positions of a turn at which the constraints must hold
 CLOSED_TO = 1e-12  # largest residual of a constraint at these positions, relative to coordinates of its pins, or to a turn
 DENSITY = 7850.0  # kg/m^3, of steel
 WIDTH, THICKNESS = 0.03, 0.01  # of links, relative to the extent of the curve
+WHEELS = 0.6  # sum of the radii of two wheels, relative to the distance of their centres
 THIN = 1e-3  # a plate with a smaller area, relative to the square of its longest side, is drawn as a bar of a given mass
 TURNS_PER_SECOND = 1.0
 SPEED = f"{60 * TURNS_PER_SECOND:g} rpm"
@@ -29,6 +30,8 @@ LinkPoint = tuple[int, complex]  # number of a link, and a place in its frame
 def pins_of_linkage(x: np.ndarray, topology: Topology) -> dict[str, list[LinkPoint]]:
     """Return the pins by name, each as a point of the links that it joins."""
     pins: dict[str, list[LinkPoint]] = {"O": [(0, complex(x[0], x[1])), (1, 0j)]}
+    if topology.ratio[0]:
+        pins["O2"] = [(0, complex(x[SECOND], x[SECOND + 1])), (GEARED, 0j)]
     names = iter([*LETTERS, *(f"{a}{k}" for k in range(1, 10) for a in LETTERS)])
     for d in range(topology.dyads):
         k, one, two = HEAD + EACH * d, BASE + 2 * d, BASE + 2 * d + 1
@@ -40,7 +43,7 @@ def pins_of_linkage(x: np.ndarray, topology: Topology) -> dict[str, list[LinkPoi
 
 
 def _link_name(number: int) -> str:
-    return "crank" if number == 1 else f"link{number - BASE + 1}"
+    return f"link{number - BASE + 1}" if number >= BASE else {1: "crank", GEARED: "crank2"}[number]
 
 
 def drawing_of(x: np.ndarray, topology: Topology, wanted: WantedCurve, name: str, unit: str = "m") -> Drawing:
@@ -58,7 +61,12 @@ def drawing_of(x: np.ndarray, topology: Topology, wanted: WantedCurve, name: str
     links = {_link_name(k): _link(members[k], places, wanted.extent, size) for k in sorted(members) if k}
     written = {pin: (z.real, z.imag) for pin, z in places.items()}
     motor, units = {"pin": "O", "speed": SPEED}, {"length": unit}
-    return Drawing(written, links, ground=members[0], motors=[motor], gravity=(0.0, 0.0), name=name, units=units)
+    rest: dict[str, Any] = {"ground": members[0], "motors": [motor], "gravity": (0.0, 0.0), "name": name, "units": units}
+    if ratio := int(topology.ratio[0]):
+        wheel = WHEELS * max(abs(places["O2"] - places["O"]), WIDTH * wanted.extent / size) / (1 + abs(ratio))
+        belt = "open" if ratio > 0 else "crossed"
+        rest["gears"] = [{"links": ["crank", "crank2"], "radii": (abs(ratio) * wheel, wheel), "belt": belt}]
+    return Drawing(written, links, **rest)
 
 
 def _link(pins: list[str], places: dict[str, complex], extent: float, size: float) -> dict[str, Any]:

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from udkjax.synthesis.curves.descent import FULL_TURN, LinkageLimits
-from udkjax.synthesis.curves.dyads import BASE, EACH, HEAD, SPAN, Topology, positions
+from udkjax.synthesis.curves.dyads import BASE, EACH, HEAD, PHASE, SECOND, SPAN, Topology, positions
 from udkjax.synthesis.curves.random_linkages import Linkages, random_linkages, turn_angles
 from udkjax.synthesis.curves.targets import WantedCurve, resampled
 
@@ -24,10 +24,16 @@ class _Matches(NamedTuple):
 
 
 def find_starts(
-    wanted: WantedCurve, limits: LinkageLimits, dyads: int, samples: int, keep: int, rng: np.random.Generator
+    wanted: WantedCurve,
+    limits: LinkageLimits,
+    dyads: int,
+    samples: int,
+    keep: int,
+    rng: np.random.Generator,
+    geared: bool = False,
 ) -> Linkages:
     """Return the linkages whose curves are most similar to the target, of `samples` random ones, moved onto it."""
-    x, topology = random_linkages(samples, dyads, rng)
+    x, topology = random_linkages(samples, dyads, rng, geared)
     at = positions(x, topology, turn_angles(samples))
     turns = (np.abs(at.cosines) < limits.cosine).all((0, 2))
     x, topology = x[turns], topology.take(turns)
@@ -102,7 +108,9 @@ def _moved(x: np.ndarray, topology: Topology, factor: np.ndarray, offset: np.nda
         x[:, k], x[:, k + 1] = np.real(p), np.imag(p)
 
     move(0, factor, offset)
-    of_link = np.stack([factor, factor * np.exp(1j * start), size + 0j])
+    move(SECOND, factor, offset)
+    x[:, PHASE] += topology.ratio * start + np.angle(factor)
+    of_link = np.stack([factor, factor * np.exp(1j * start), size + 0j, size + 0j])
     rows = np.arange(len(x))
     for d in range(topology.dyads):
         k = HEAD + EACH * d

@@ -12,11 +12,10 @@ from udkjax.requirements import require_choice
 from udkjax.scene.arguments import checked
 from udkjax.scene.drawing.drawn_quantities import Units
 from udkjax.synthesis.curves.curve_designs import CurveDesigns, ranked
-from udkjax.synthesis.curves.curve_search import CurveSearch, OutOfTimeError
+from udkjax.synthesis.curves.curve_search import FEWEST_BARS, CurveSearch, OutOfTimeError
 from udkjax.synthesis.curves.descent import LinkageLimits
 from udkjax.synthesis.curves.targets import CHAMFER_POINTS, WantedCurve
 
-FEWEST_BARS = 4
 SIZE = 3.0  # of a mechanism by default: largest distance of its pins from the middle of the curve, in extents of the curve
 TRANSMISSION = float(np.deg2rad(8.0))  # smallest transmission angle by default
 SHORTEST = 0.02  # smallest distance of two joints of a dyad's link, in extents of the curve
@@ -73,8 +72,10 @@ def mechanisms_for(
     """
     require_choice("part", part, ("free", "whole"))
     require_choice("unit", unit, tuple(Units.sizes("m")))
+    if bars < FEWEST_BARS:
+        raise ValueError(f"bars must be at least {FEWEST_BARS}: the ground, a crank and a dyad; not {bars}")
     wanted = WantedCurve(curve, part == "whole")
-    search = CurveSearch(wanted, curve_limits(wanted, size, float(transmission)), _dyads(int(bars)), int(seed))
+    search = CurveSearch(wanted, curve_limits(wanted, size, float(transmission)), int(bars), int(seed))
     begun = time.process_time()
     done = _run(search, float(seconds), rounds, begun, progress)
     found = ranked(search.found, wanted, int(results), WORTH, unit)
@@ -104,12 +105,6 @@ def _run(search: CurveSearch, seconds: float, rounds: int | None, begun: float, 
     search.until = np.inf
     search.finish(begun + seconds)
     return done
-
-
-def _dyads(bars: int) -> int:
-    if bars < FEWEST_BARS:
-        raise ValueError(f"bars must be at least {FEWEST_BARS}: the ground, a crank and a dyad; not {bars}")
-    return (bars - 2) // 2
 
 
 def curve_limits(wanted: WantedCurve, size: float | None, transmission: float) -> LinkageLimits:

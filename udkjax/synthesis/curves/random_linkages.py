@@ -7,9 +7,22 @@ the smallest: lengths are drawn within these limits, so that no linkage is rejec
 import numpy as np
 
 from udkjax.synthesis.curves.descent import FULL_TURN, Sampling
-from udkjax.synthesis.curves.dyads import BASE, EACH, HEAD, SPAN, TAIL, Topology, number_count, positions
+from udkjax.synthesis.curves.dyads import (
+    BASE,
+    EACH,
+    GEARED,
+    HEAD,
+    PHASE,
+    SECOND,
+    SPAN,
+    TAIL,
+    Topology,
+    number_count,
+    positions,
+)
 from udkjax.synthesis.curves.targets import CurveTarget
 
+RATIOS = (1, -1, 2, -2, 3, -3, 4, -4, 5, -5)  # turns of a second crank for one of the crank
 TURN_VALUES = 72  # angles of the crank over a turn
 Linkages = tuple[np.ndarray, Topology]
 
@@ -19,19 +32,24 @@ def turn_angles(K: int) -> np.ndarray:
     return np.broadcast_to(np.arange(TURN_VALUES) * (FULL_TURN / TURN_VALUES), (K, TURN_VALUES))
 
 
-def random_linkages(K: int, dyads: int, rng: np.random.Generator) -> Linkages:
-    """Return K random linkages with cranks of about unit length."""
+def random_linkages(K: int, dyads: int, rng: np.random.Generator, geared: bool = False) -> Linkages:
+    """Return K random linkages with cranks of about unit length; geared ones begin with a five-bar of two cranks."""
     x = np.zeros((K, number_count(dyads)))
     x[:, SPAN] = FULL_TURN
     first, second = np.ones((K, dyads), int), np.zeros((K, dyads), int)
-    topology = Topology(first, second, rng.choice([-1.0, 1.0], (K, dyads)))
+    ratio = rng.choice(RATIOS, K) if geared else np.zeros(K, int)
+    topology = Topology(first, second, rng.choice([-1.0, 1.0], (K, dyads)), ratio)
     x[:, HEAD] = np.exp(rng.normal(0.0, 0.3, K))
     pivot = np.exp(rng.normal(0.7, 0.5, K)) * np.exp(1j * rng.uniform(0.0, FULL_TURN, K))
-    x[:, HEAD + 2], x[:, HEAD + 3] = np.real(pivot), np.imag(pivot)
+    at = HEAD + 2
+    if geared:
+        at, second[:, 0] = SECOND, GEARED
+        x[:, PHASE], x[:, HEAD + 2] = rng.uniform(0.0, FULL_TURN, K), np.exp(rng.normal(-0.3, 0.5, K))
+    x[:, at], x[:, at + 1] = np.real(pivot), np.imag(pivot)
     for d in range(dyads):
         k, links = HEAD + EACH * d, BASE + 2 * d
         if d:
-            likely = np.array([1.0, 0.5, *[1.0] * (2 * d - 2), 2.0, 2.0])  # rather the last links: deeper linkages
+            likely = np.array([1.0, 0.5, 0.5 * geared, *[1.0] * (2 * d - 2), 2.0, 2.0])  # rather the last links: deeper linkages
             A, B = rng.choice(links, (2, K), p=likely / likely.sum())
             A = np.where(A == B, np.where(links - 2 == B, links - 1, links - 2), A)
             first[:, d], second[:, d] = A, B
@@ -47,7 +65,7 @@ def closing_lengths(x: np.ndarray, topology: Topology, theta: np.ndarray, d: int
     k = HEAD + EACH * (d + 1)
     known = np.concatenate([x[:, :k], x[:, -TAIL:]], 1)
     known[:, k - 2 : k] = 1.0
-    part = Topology(topology.first[:, : d + 1], topology.second[:, : d + 1], topology.side[:, : d + 1])
+    part = Topology(*(a[:, : d + 1] for a in topology[:3]), topology.ratio)
     at = positions(known, part, theta)
     distance = np.abs(at.origins[-1] - at.origins[-2])
     far, near = distance.max(1), distance.min(1)
@@ -77,14 +95,16 @@ def grown(linkages: Linkages, target: CurveTarget, sample: Sampling, tries: int,
     parent, links = np.repeat(np.arange(K), tries), BASE + 2 * D
     x, topology = x[parent], topology.take(parent)
     A = np.full(n, links - 2)
-    B = rng.integers(0, links - 1, n)
+    has_second = topology.ratio != 0
+    B = rng.integers(0, links - 2 + has_second)
+    B += (B >= GEARED) & ~has_second
     B += links - 2 == B
     B = np.where(rng.random(n) < 0.3, 0, B)
     k = HEAD + EACH * D
     y = np.concatenate([x[:, :k], x[:, -TAIL:], random_places(x, B, rng), np.ones((n, 2)), np.zeros((n, 2))], 1)
     side = rng.choice([-1.0, 1.0], (n, 1))
-    first, second, sides = (np.concatenate(pair, 1) for pair in zip(topology, (A[:, None], B[:, None], side), strict=True))
-    new = Topology(first, second, sides)
+    joined = (np.concatenate(pair, 1) for pair in zip(topology[:3], (A[:, None], B[:, None], side), strict=True))
+    new = Topology(*joined, topology.ratio)
     theta = sample.angles(y)
     y[:, k + 4 : k + 6] = closing_lengths(y, new, theta, D, rng)
     at = positions(y, new, theta)
