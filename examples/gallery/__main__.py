@@ -48,6 +48,7 @@ GROUPS = {
     },
     "Design": {
         "designed_paths": ("Paths by design", "follow the foot, which stays level on the ground"),
+        "drawn_curves": ("Letters and a star", "count the teeth of the star while its second crank turns"),
         "six_bar_dwell": ("Six-bar with a dwell", "watch the output rest for a third of a turn"),
     },
     "Chaos": {"double_pendulum_map": ("A map of chaos", "compare pendulums that start next to each other")},

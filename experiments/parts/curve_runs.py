@@ -21,6 +21,7 @@ from udkjax.synthesis.curves.targets import WantedCurve
 BARS = (4, 6, 8, 10, 12)
 MOST_RESULTS = 25  # designs of a search: with each number of bars
 PATH, SEGMENTS = 240, 60  # numbers in the data of a curve
+LONG = 600.0  # CPU time that no search takes (s)
 TIMES = 40  # progress reports of a search
 STARTS, STEPS = 300, 100  # of BFGS: random linkages, and steps with each of two blurs
 Result = dict[str, Any]
@@ -40,8 +41,8 @@ def stored(folder: Path | None, name: str, compute: Callable[[], Result]) -> Res
     return result
 
 
-def search(curve: np.ndarray, seconds: float, seed: int = 0) -> Result:
-    """Return what `udk.mechanisms_for` finds by default within CPU seconds, each design checked."""
+def search(curve: np.ndarray, rounds: int, seed: int = 0) -> Result:
+    """Return what `udk.mechanisms_for` finds by default within some rounds, and checks of the best design."""
     reports: list[tuple[float, float]] = []
     begun = time.process_time()
 
@@ -50,7 +51,7 @@ def search(curve: np.ndarray, seconds: float, seed: int = 0) -> Result:
         if said:
             reports.append((time.process_time() - begun, float(error)))
 
-    found = udk.mechanisms_for(curve, seconds=seconds, seed=seed, results=MOST_RESULTS, progress=note)
+    found = udk.mechanisms_for(curve, seconds=LONG, rounds=rounds, seed=seed, results=MOST_RESULTS, progress=note)
     spent, best = time.process_time() - begun, min(found, key=lambda one: one.error)
     errors = [min((one.error for one in found if one.bars <= bars), default=np.inf) for bars in BARS]
     reports = [*reports[-TIMES + 1 :], (spent, best.error)]

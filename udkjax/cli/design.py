@@ -29,6 +29,7 @@ def design(
     bars: int = 12,
     size: float | None = None,
     seconds: float = 60.0,
+    geared: bool = True,
     unit: str = "mm",
     json: Json = False,
 ) -> None:
@@ -53,13 +54,15 @@ def design(
         bars: largest number of links for a curve, with the ground.
         size: for a curve, the largest distance of any pin from its middle, in its unit; by default three times its extent.
         seconds: CPU time after which the search for a curve ends (s).
+        geared: whether mechanisms for a curve may have a second crank, joined to the first by a belt.
         unit: unit of the curve and of the drawings.
     """
     for name, value, minimum in (("starts", starts, 1), ("results", results, 1), ("seed", seed, 0)):
         if value < minimum:
             refuse(f"--{name} {value}: must be at least {minimum}")
     if goal is None and curve is not None:
-        _show_curve(curve, {"bars": bars, "seed": seed, "results": results, "seconds": seconds}, size, unit, out, json)
+        given = {"bars": bars, "seed": seed, "results": results, "seconds": seconds, "geared": geared}
+        _show_curve(curve, given, size, unit, out, json)
         return
     if goal is None or curve is not None:
         refuse("give either a goal file or --curve FILE")

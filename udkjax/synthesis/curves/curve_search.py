@@ -97,10 +97,12 @@ class CurveSearch:
         limits: the limits.
         bars: the largest number of links, with the ground.
         seed: seed of all random numbers.
+        geared: whether every second round begins with two geared cranks, if there are enough bars.
     """
 
-    def __init__(self, wanted: WantedCurve, limits: LinkageLimits, bars: int, seed: int):
+    def __init__(self, wanted: WantedCurve, limits: LinkageLimits, bars: int, seed: int, geared: bool = True):
         self.wanted, self.limits, self.bars = wanted, limits, bars
+        self.geared = geared and bars > FEWEST_BARS
         self.seed, self.families, self.candidates = seed, 0, 0
         inner = limits._replace(cosine=limits.cosine - 2 * SLACK, size=limits.size * (1.0 - 2 * SLACK))
         self.coarse = Task(wanted.target(96), sampling(64, 32, wanted.is_whole), inner)
@@ -116,13 +118,12 @@ class CurveSearch:
         """Run the search, without end; yield a description of each stage when it is completed.
 
         A round begins anew, since what grows best is not known from its start; then the best linkages of all rounds grow again.
-        Every second round begins with two geared cranks.
         """
         done = 0
         while True:
             rng = np.random.default_rng((self.seed, done))
             self.fresh = fresh = {}
-            fewest = FEWEST_BARS + (done % 2 if self.bars > FEWEST_BARS else 0)
+            fewest = FEWEST_BARS + (done % 2 if self.geared else 0)
             for bars in range(fewest, min(fewest + 2 * START_DYADS, self.bars + 1), 2):
                 self._start(fresh, bars, rng)
                 yield f"round {done + 1}: random linkages of {bars} bars"
@@ -217,7 +218,9 @@ class CurveSearch:
     def verified(self, x: np.ndarray, topology: Topology) -> FoundLinkage | None:
         """Return the linkage if it is within the limits over the whole turn."""
         at = positions(x[None], topology, np.arange(CHECKED)[None] * (2 * np.pi / CHECKED), 0.0)
-        joints = np.concatenate([at.origins[1:] if topology.ratio[0] else np.delete(at.origins[1:], GEARED - 1, 0), at.ends, at.pin[None]])
+        joints = np.concatenate(
+            [at.origins[1:] if topology.ratio[0] else np.delete(at.origins[1:], GEARED - 1, 0), at.ends, at.pin[None]]
+        )
         cosine, size = float(np.abs(at.cosines).max()), float(np.abs(joints).max())
         if not (cosine <= self.limits.cosine and size <= self.limits.size):
             return None

@@ -8,7 +8,18 @@ from typing import NamedTuple
 import numpy as np
 
 from udkjax.synthesis.curves.comparison import compare
-from udkjax.synthesis.curves.dyads import BASE, EACH, HEAD, PHASE, SPAN, DyadPositions, Topology, gradients, number_count, positions
+from udkjax.synthesis.curves.dyads import (
+    BASE,
+    EACH,
+    HEAD,
+    PHASE,
+    SPAN,
+    DyadPositions,
+    Topology,
+    gradients,
+    number_count,
+    positions,
+)
 from udkjax.synthesis.curves.targets import CurveTarget
 
 FULL_TURN = 2.0 * np.pi

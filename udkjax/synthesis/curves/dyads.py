@@ -1,13 +1,12 @@
 """Linkages of dyads in lanes: every position by an intersection of circles, derivatives by statics.
 
-Link 0 is the ground, link 1 the crank, link 2 a second crank that turns `ratio` times as fast, by gears or a belt. Dyad d adds the
-links 3 + 2 d, from its joint P on one link to its joint R, and 4 + 2 d, from its joint Q on another link to R. The drawing pin is a
+Link 0 is the ground, link 1 the crank, link 2 a second crank that turns `ratio` times as fast, by a belt. Dyad d adds the links
+3 + 2 d, from its joint P on one link to its joint R, and 4 + 2 d, from its joint Q on another link to R. The drawing pin is a
 point of the last dyad's first link. The frame of a link has its origin at O, P or Q, and its x axis points to R.
 
 The numbers x of a linkage are: the place of O (2), the part of the turn that draws the curve (rad), the pivot of the second crank
-(2) and its angle at the beginning (rad), for each dyad the places of P
-and Q on their links (4) and the lengths P-R and Q-R (2), and the place of the drawing pin on its link (2). Places are complex
-numbers.
+(2) and its angle at the beginning (rad), for each dyad the places of P and Q on their links (4) and the lengths P-R and Q-R (2),
+and the place of the drawing pin on its link (2). Places are complex numbers.
 """
 
 from typing import Any, NamedTuple

@@ -36,6 +36,7 @@ def mechanisms_for(
     part: str = "free",
     transmission: Annotated[float, NOT_NEGATIVE] = TRANSMISSION,
     rounds: Annotated[int, COUNT] | None = None,
+    geared: bool = True,
     unit: str = "m",
     progress: ProgressOption = None,
 ) -> CurveDesigns:
@@ -43,7 +44,8 @@ def mechanisms_for(
 
     Random linkages of one to three dyads that turn are matched with the curve by shape, and the best are improved in lanes by
     Levenberg-Marquardt steps towards a small Chamfer distance, which does not depend on the order of strokes. The best ones grow
-    by dyads, at first without a change of the curve, and are improved again, up to the number of bars.
+    by dyads, at first without a change of the curve, and are improved again, up to the number of bars. Every second round begins
+    with two cranks of which one turns a whole number of times as fast, by a belt: such linkages draw stars and roses.
 
     Args:
         curve: points (n, 2) (m), in order; the curve is closed if its ends nearly meet, as if one more of its steps joined them.
@@ -60,6 +62,7 @@ def mechanisms_for(
         transmission: smallest angle (rad) between the two links of a dyad, and between one and the other prolonged, over the
             whole turn.
         rounds: number of rounds after which the search ends.
+        geared: whether a second crank, joined to the first by a belt, is allowed.
         unit: unit of lengths of the drawings, such as "mm"; it does not change the mechanisms.
         progress: as for `sweep`: None shows progress after two seconds, False never; or a function of a `Progress`. Ctrl-C ends
             the search with the best designs so far.
@@ -75,7 +78,7 @@ def mechanisms_for(
     if bars < FEWEST_BARS:
         raise ValueError(f"bars must be at least {FEWEST_BARS}: the ground, a crank and a dyad; not {bars}")
     wanted = WantedCurve(curve, part == "whole")
-    search = CurveSearch(wanted, curve_limits(wanted, size, float(transmission)), int(bars), int(seed))
+    search = CurveSearch(wanted, curve_limits(wanted, size, float(transmission)), int(bars), int(seed), geared)
     begun = time.process_time()
     done = _run(search, float(seconds), rounds, begun, progress)
     found = ranked(search.found, wanted, int(results), WORTH, unit)
