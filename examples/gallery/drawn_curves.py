@@ -1,7 +1,7 @@
 """Letters and a star, each drawn by a linkage with one motor that `udk.mechanisms_for` found.
 
-Nothing but the curve is given; structure and dimensions of the linkages are found. Letters are drawn by a part of the turn, in which
-the pin may retrace a stroke. The star takes a second crank, driven by a belt at a multiple of the speed of the first.
+Nothing but the curve is given; structure and dimensions of the linkages are found. Letters are drawn by a part of the turn, in
+which the pin may retrace a stroke. The star takes a second crank, driven by a belt at a multiple of the speed of the first.
 """
 
 import numpy as np

@@ -7,6 +7,7 @@ import udkjax as udk
 from udkjax.synthesis.curves.curve_search import CurveSearch, OutOfTimeError
 from udkjax.synthesis.curves.descent import LinkageLimits
 from udkjax.synthesis.curves.dyads import BASE, EACH, HEAD, SPAN, Topology, gradients, number_count, positions
+from udkjax.synthesis.curves.linkage_drawing import drawing_of, is_closed_over_turn, states_of_turn
 from udkjax.synthesis.curves.random_linkages import random_linkages, turn_angles
 from udkjax.synthesis.curves.targets import WantedCurve, as_points, chamfer
 
@@ -51,6 +52,29 @@ def test_a_four_bar_has_the_positions_of_the_drawing():
     np.testing.assert_allclose(np.abs(R - P), 2.5, rtol=1e-12)
     np.testing.assert_allclose(np.abs(R - Q), 2.0, rtol=1e-12)
     np.testing.assert_allclose(P, np.exp(1j * np.array([0.0, 1.0])), rtol=1e-12)
+
+
+def test_a_linkage_with_two_cranks_is_the_mechanism_of_its_drawing():
+    wanted = WantedCurve(ELLIPSE)
+    x, topology = random_linkages(100, 2, np.random.default_rng(2), geared=True)
+    for ratio in (1, -1, 3, -5):
+        k = np.flatnonzero(topology.ratio == ratio)[:1]
+        one = topology.take(k)
+        mechanism = drawing_of(x[k[0]], one, wanted, "geared").mechanism()
+        states = states_of_turn(mechanism, x[k[0]], one, wanted)
+        assert is_closed_over_turn(mechanism, states, 10.0 * wanted.extent)
+        turned = np.ptp(states.q[:, list(mechanism.bodies).index("crank2"), 2])
+        np.testing.assert_allclose(turned, abs(ratio) * 2 * np.pi, rtol=1e-12)
+
+
+@pytest.mark.slow
+def test_two_cranks_draw_a_star_that_one_does_not():
+    corners = np.arange(11)
+    star = as_points(np.where(corners % 2, 0.45, 1.0) * np.exp(1j * np.pi * (0.5 + corners / 5)))
+    given = {"bars": 9, "seconds": 600, "rounds": 2, "results": 3, "progress": False}
+    best, plain = udk.mechanisms_for(star, **given)[0], udk.mechanisms_for(star, geared=False, **given)
+    assert best.bars == 9 and best.error < 0.02 and np.asarray(best.motion(721).reached).all()
+    assert all(one.bars % 2 == 0 and one.error > 4 * best.error for one in plain)
 
 
 def test_the_distance_of_parallel_lines_is_twice_their_gap():
