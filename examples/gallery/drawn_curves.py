@@ -14,6 +14,8 @@ LETTERS = {
     "D": "M0 6 V0 H1 A3 3 0 0 1 1 6 Z",
     "K": "M0 0 V6 V3.6 L4 0 L1.5 2.25 L4 6",
 }
+SIZE = 8.0  # m, from the middle of a curve that is 6 m high
+TURN = 1.0  # s, at 60 rpm
 FRAMES = 161
 MOMENT = 0.95  # fraction of the motion at which its picture is taken
 
@@ -21,14 +23,15 @@ MOMENT = 0.95  # fraction of the motion at which its picture is taken
 def make():
     """Return the errors, and the player of all mechanisms side by side."""
     corners = np.arange(11)
-    star = np.where(corners % 2, 0.45, 1.0) * np.exp(1j * np.pi * (0.5 + corners / 5))
+    star = np.where(corners % 2, 1.8, 4.0) * np.exp(1j * np.pi * (0.5 + corners / 5))
     curves = {name: points_of_path(path) for name, path in LETTERS.items()} | {"star": np.stack([star.real, star.imag], 1)}
     facts, mechanisms, motions = {}, {}, {}
     for name, curve in curves.items():
-        best = udk.mechanisms_for(curve, seconds=600, rounds=1 + (name == "star"), results=1, progress=False)[0]
+        best = udk.mechanisms_for(curve, size=SIZE, seconds=600, rounds=1 + (name == "star"), results=1, progress=False)[0]
         facts[f"{name}: error relative to its RMS radius, by {best.bars} bars"] = best.error
         mechanisms[name] = best.mechanism
-        motions[name] = udk.kinematics(best.mechanism, best.driver, np.linspace(*best.values, FRAMES))
+        share = np.ptp(best.values) / (2 * np.pi)
+        motions[name] = udk.simulate(best.mechanism, np.linspace(0.0, share * TURN, FRAMES))
     return facts, {"motion": udk.animate(mechanisms, motions, traces=["P"])}
 
 

@@ -111,6 +111,7 @@ class CurveSearch:
         self.fresh: dict[int, Kept] = {}  # of this round
         self.finished: set[float] = set()  # losses of linkages that are finished
         self.found: dict[int, list[FoundLinkage]] = {}
+        self.turned: set[int] = set()  # numbers of bars of which a finished linkage was within the limits
         self.threads = ThreadPoolExecutor(thread_count())
         self.until = np.inf  # CPU time (`time.process_time`) at which descents end with an `OutOfTimeError`
 
@@ -142,17 +143,14 @@ class CurveSearch:
         return min((one.error for found in self.found.values() for one in found), default=np.inf)
 
     def finish(self, until: float = np.inf) -> None:
-        """Finish the best linkages, the most promising first, also of an incomplete round; after a time only the first ones.
+        """Finish the best linkages, the most promising first, also of an incomplete round; after a time only until there is one.
 
-        While none is within the limits, the next ones are tried.
+        Of each number of bars, the next ones are tried while none was within the limits.
         """
         self._merge()
         order = sorted((n for n, kept in self.beams.items() if len(kept.x)), key=lambda n: self.beams[n].loss[0])
         for bars in order:
-            if time.process_time() < until or not self.found:
-                self._finish(bars)
-        for bars in order:
-            while not self.found and self._finish(bars):
+            while (time.process_time() < until or not self.found) and self._finish(bars):
                 pass
 
     def _start(self, beams: dict[int, Kept], bars: int, rng: np.random.Generator) -> None:
@@ -198,12 +196,12 @@ class CurveSearch:
         return Descended(*(np.concatenate(a) for a in zip(*results, strict=True)))
 
     def _finish(self, bars: int) -> bool:
-        """Finish the best linkages of a number of bars, or the next ones if there is no result; return False if all are."""
+        """Finish the best linkages of a number of bars, or the next ones; return True while there may be more and none turned."""
         kept = self.beams[bars]
-        new = [k for k, loss in enumerate(kept.loss) if loss not in self.finished and (k < FINISHED or not self.found)]
-        new = new[:FINISHED]
+        new = [k for k, loss in enumerate(kept.loss) if loss not in self.finished and (k < FINISHED or bars not in self.turned)]
         if not new:
             return False
+        new = new[:FINISHED]
         kept = kept.take(np.array(new))
         x = kept.x
         for blur, weight, steps in OF_FINISH:
@@ -212,8 +210,9 @@ class CurveSearch:
         for k in range(len(x)):
             one = self.verified(*without_idle_dyads(x[k], kept.topology.take(slice(k, k + 1))))
             if one is not None:
+                self.turned.add(bars)
                 self.found[one.bars] = sorted([*self.found.get(one.bars, []), one], key=lambda f: f.error)[:BEAM]
-        return True
+        return bars not in self.turned
 
     def verified(self, x: np.ndarray, topology: Topology) -> FoundLinkage | None:
         """Return the linkage if it is within the limits over the whole turn."""
