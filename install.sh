@@ -1,6 +1,6 @@
 #!/bin/sh
 # Puts udkjax, with all that it can use but Jupyter, into a virtual environment of its own. Safe to repeat.
-#   sh install.sh [--notebook] [--test] [--browser] [--dev] [--docs] [--python VERSION | NAME | PATH] [--venv FOLDER]
+#   sh install.sh [--notebook] [--test] [--browser] [--fmi] [--dev] [--docs] [--python VERSION | NAME | PATH] [--venv FOLDER]
 # By default it takes the newest Python of this machine and makes .venv. uv is used where there is one, and not needed.
 # Exit status: 0 installed, 1 failed, 2 wrong usage, 3 no suitable Python.
 set -eu
@@ -9,7 +9,7 @@ die() { printf 'udkjax: %s\n' "$2" >&2 && exit "$1"; }
 extras=all venv=.venv wanted='' other=python3
 while [ $# -gt 0 ]; do
     case $1=${2-} in
-    --notebook=* | --test=* | --browser=* | --dev=* | --docs=*) extras=$extras,${1#--} ;;
+    --notebook=* | --test=* | --browser=* | --fmi=* | --dev=* | --docs=*) extras=$extras,${1#--} ;;
     --python=3.*) wanted=$2 && shift ;;
     --python=?*) wanted=$2 other=$2 && shift ;;
     --venv=?*) venv=$2 && shift ;;

@@ -1,7 +1,7 @@
 """Scenes out of Python: C and FMUs beside the engine, control steps in batches, a learning curve, and a receding horizon.
 
 The C is compiled with `cc -O2 -march=native`, which fuses products as the engine does where the processor can. FMPy runs the FMUs
-(`pip install fmpy`) if it is there. The control figures run the code of the page `docs/how-to/learn.md`.
+if it is there: `sh install.sh --fmi`. The control figures run the code of the page `docs/how-to/learn.md`.
 """
 
 import shutil

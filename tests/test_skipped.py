@@ -17,11 +17,13 @@ def skip(reason, node="tests/a.py::test_it"):
 def test_reasons_are_counted_and_say_what_would_help():
     needed = "a browser is needed: playwright (sh install.sh --test --browser)"
     reports = [skip("singular"), *[skip(needed)] * 3, skip("could not import 'nbformat': No module named 'nbformat'")]
+    reports += [skip("could not import 'fmpy': No module named 'fmpy'")]
     reports.append(skip("could not import 'wasmtime': No module named 'wasmtime'", "tests/native/wasm/test_engine.py"))
     assert skipped_for(reports) == [
         f"3 tests skipped: {needed}",
         "1 test skipped: singular",
         "1 test skipped: nbformat is not installed: sh install.sh --test --notebook",
+        "1 test skipped: fmpy is not installed: sh install.sh --test --fmi",
         "1 file skipped: wasmtime is not installed: sh install.sh --test",
     ]
     assert skipped_for([]) == []

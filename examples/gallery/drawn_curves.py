@@ -24,13 +24,15 @@ def make():
     """Return the errors, and the player of all mechanisms side by side."""
     corners = np.arange(11)
     star = np.where(corners % 2, 1.8, 4.0) * np.exp(1j * np.pi * (0.5 + corners / 5))
-    curves = {name: points_of_path(path) for name, path in LETTERS.items()} | {"star": np.stack([star.real, star.imag], 1)}
+    curves = {name: points_of_path(path) for name, path in LETTERS.items()} | {
+        "star": np.stack([np.real(star), np.imag(star)], 1)
+    }
     facts, mechanisms, motions = {}, {}, {}
     for name, curve in curves.items():
         best = udk.mechanisms_for(curve, size=SIZE, seconds=600, rounds=1 + (name == "star"), results=1, progress=False)[0]
         facts[f"{name}: error relative to its RMS radius, by {best.bars} bars"] = best.error
         mechanisms[name] = best.mechanism
-        share = np.ptp(best.values) / (2 * np.pi)
+        share = float(np.ptp(best.values)) / (2 * np.pi)
         motions[name] = udk.simulate(best.mechanism, np.linspace(0.0, share * TURN, FRAMES))
     return facts, {"motion": udk.animate(mechanisms, motions, traces=["P"])}
 

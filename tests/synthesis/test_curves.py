@@ -24,7 +24,7 @@ def test_derivatives_of_linkages_are_those_of_their_positions(geared):
         at = positions(y, topology, y[:, SPAN, None] * share)
         joints = np.stack([at.origins[BASE::2], at.origins[BASE + 1 :: 2], at.ends])
         third = np.sum(at.cosines**2, 0) + np.sum(np.abs(joints) ** 2, (0, 1))
-        return at, joints, np.stack([at.pin.real, at.pin.imag, third], 1)
+        return at, joints, np.stack([np.real(at.pin), np.imag(at.pin), third], 1)
 
     at, joints, _ = measures(x)
     found = gradients(x, topology, at, share, 2 * joints[:2], 2 * joints[2], 2 * at.cosines)

@@ -65,7 +65,7 @@ def closing_lengths(x: np.ndarray, topology: Topology, theta: np.ndarray, d: int
     k = HEAD + EACH * (d + 1)
     known = np.concatenate([x[:, :k], x[:, -TAIL:]], 1)
     known[:, k - 2 : k] = 1.0
-    part = Topology(*(a[:, : d + 1] for a in topology[:3]), topology.ratio)
+    part = topology._replace(first=topology.first[:, : d + 1], second=topology.second[:, : d + 1], side=topology.side[:, : d + 1])
     at = positions(known, part, theta)
     distance = np.abs(at.origins[-1] - at.origins[-2])
     far, near = distance.max(1), distance.min(1)
@@ -103,8 +103,8 @@ def grown(linkages: Linkages, target: CurveTarget, sample: Sampling, tries: int,
     k = HEAD + EACH * D
     y = np.concatenate([x[:, :k], x[:, -TAIL:], random_places(x, B, rng), np.ones((n, 2)), np.zeros((n, 2))], 1)
     side = rng.choice([-1.0, 1.0], (n, 1))
-    joined = (np.concatenate(pair, 1) for pair in zip(topology[:3], (A[:, None], B[:, None], side), strict=True))
-    new = Topology(*joined, topology.ratio)
+    first, second, sides = (np.concatenate(pair, 1) for pair in zip(topology[:3], (A[:, None], B[:, None], side), strict=True))
+    new = Topology(first, second, sides, topology.ratio)
     theta = sample.angles(y)
     y[:, k + 4 : k + 6] = closing_lengths(y, new, theta, D, rng)
     at = positions(y, new, theta)
