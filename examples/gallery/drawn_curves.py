@@ -29,7 +29,7 @@ def make():
     }
     facts, mechanisms, motions = {}, {}, {}
     for name, curve in curves.items():
-        best = udk.mechanisms_for(curve, size=SIZE, seconds=600, rounds=1 + (name == "star"), results=1, progress=False)[0]
+        best = udk.mechanisms_for(curve, size=SIZE, seconds=600, rounds=1 + (name in ("K", "star")), results=1, progress=False)[0]
         facts[f"{name}: error relative to its RMS radius, by {best.bars} bars"] = best.error
         mechanisms[name] = best.mechanism
         share = float(np.ptp(best.values)) / (2 * np.pi)
