@@ -8,7 +8,10 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq, minimize_scalar
 
+pytest.importorskip("experiments", reason="not in a source tree")
+
 import udkjax as udk
+from experiments.parts.gap_linkages import placed, random_linkage
 from tests.command_line import udkjax
 from udkjax.positions.gaps.convex import feature, gap_at, signed_distance
 from udkjax.positions.gaps.shapes import convex_pieces, hull
@@ -98,38 +101,6 @@ def test_a_bar_that_turns_past_a_disc_has_the_gap_of_its_end():
     assert found.distance == pytest.approx(np.hypot(0.15, 0.02) - 0.1 - 0.01 - 0.015, abs=1e-15)
     assert found.value == pytest.approx(np.arctan2(0.02, 0.15), abs=1e-9)
     assert np.allclose(np.diff(found.points, axis=0), found.distance * np.array([0.15, 0.02]) / np.hypot(0.15, 0.02), atol=1e-12)
-
-
-def random_linkage(seed):
-    """A four-bar with a plate as coupler, driven through its range, and a dyad on the plate; widths at random."""
-    rng = np.random.default_rng(seed)
-    while True:
-        pins = dict(zip("OABCEFG", rng.uniform(-1, 1, (7, 2)), strict=True))
-        pins["A"] = pins["O"] + rng.uniform(0.1, 0.3) * (pins["A"] - pins["O"])
-        w = rng.uniform(0.02, 0.1, 4)
-        links = {
-            "crank": udk.Link(["O", "A"], mass=1, width=w[0]),
-            "plate": udk.Link(["A", "B", "E"], mass=1),
-            "rocker": udk.Link(["B", "C"], mass=1, width=w[1]),
-            "rod": udk.Link(["E", "F"], mass=1, width=w[2]),
-            "lever": udk.Link(["F", "G"], mass=1, width=w[3]),
-        }
-        drawing = udk.Drawing(pins=pins, links=links, ground=["O", "C", "G"], motors={"motor": {"pin": "O", "speed": 1.0}})
-        mech = drawing.mechanism()
-        start = float(
-            udk.Coordinate.of(mech.drivers["motor"]).value(udk.Frame(0.0, 0.0, 0.0, 1.0, 0.0), mech.bodies["crank"].frame())
-        )
-        motion = udk.kinematics(mech, "motor", np.linspace(start - 0.4, start + 0.4, 60))
-        if np.asarray(motion.reached).all():
-            return mech, [start - 0.4, start + 0.4]
-
-
-def placed(mech, name, q):
-    """Corners of a link in the world (corners, 2, ...), and its radius, from the drawing."""
-    link, local = mech.drawing.links[name], np.asarray(mech.drawing.shapes()[name])
-    x, y, angle = np.moveaxis(np.asarray(q)[..., mech.body_names.index(name), :], -1, 0)
-    turned = [[x + np.cos(angle) * a - np.sin(angle) * b, y + np.sin(angle) * a + np.cos(angle) * b] for a, b in local]
-    return np.array(turned), 0.0 if link.width is None else 0.5 * float(link.width)
 
 
 SEEDS = [range(4), *(pytest.param(range(k, k + 23), marks=pytest.mark.slow) for k in (4, 27))]

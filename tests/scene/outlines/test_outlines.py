@@ -3,16 +3,13 @@
 import numpy as np
 import pytest
 
+pytest.importorskip("experiments", reason="not in a source tree")
+pytest.importorskip("ezdxf")
+
 import udkjax as udk
+from experiments.parts.outline_profiles import add_slot, combined, disc, document, profile, slot
 
-ezdxf = pytest.importorskip("ezdxf")
 MM = 1e-3
-
-
-def document(unit=4):
-    file = ezdxf.new("R2010")
-    file.header["$INSUNITS"] = unit
-    return file, file.modelspace()
 
 
 def read(file, tmp_path, **options):
@@ -20,97 +17,13 @@ def read(file, tmp_path, **options):
     return udk.read_outline(tmp_path / "link.dxf", **options)
 
 
-def disc(r, at):
-    return np.pi * r**2, np.array(at, float), r**2 / 2
-
-
-def slot(length, r, at, angle):
-    """A rectangle with two half discs: area, centre, squared radius of gyration about it."""
-    half = 4 * r / (3 * np.pi)
-    area = 2 * length * r + np.pi * r**2
-    moment = 2 * length * r * (length**2 + 4 * r**2) / 12
-    moment += np.pi * r**2 * (r**2 / 2 - half**2 + (length / 2 + half) ** 2)
-    return area, np.array(at, float), moment / area
-
-
-def segment(R, angle, at, turn):
-    """The part of a disc beyond a chord."""
-    area = R**2 * (angle - np.sin(angle)) / 2
-    d = 4 * R * np.sin(angle / 2) ** 3 / (3 * (angle - np.sin(angle)))
-    about_centre = R**4 / 4 * (angle - np.sin(angle) * (2 + np.cos(angle)) / 3)
-    return area, np.array(at) + d * np.array([np.cos(turn), np.sin(turn)]), about_centre / area - d**2
-
-
-def rectangle(a, b, at):
-    return a * b, np.array(at, float), (a**2 + b**2) / 12
-
-
-def combined(parts):
-    """Area, centroid and squared radius of gyration of figures with signs."""
-    area = sum(sign * A for sign, (A, _, _) in parts)
-    centre = sum(sign * A * c for sign, (A, c, _) in parts) / area
-    moment = sum(sign * A * (k + (c - centre) @ (c - centre)) for sign, (A, c, k) in parts)
-    return area, centre, moment / area
-
-
-def add_slot(space, length, r, at, angle, bulged, rng):
-    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    p = [np.array(at) + turn @ x for x in ([-length / 2, -r], [length / 2, -r], [length / 2, r], [-length / 2, r])]
-    if bulged:
-        space.add_lwpolyline([(*p[0], 0), (*p[1], 1), (*p[2], 0), (*p[3], 1)], format="xyb", close=True)
-        return
-    deg = np.rad2deg(angle)
-    pieces = [
-        lambda: space.add_line(p[0], p[1]),
-        lambda: space.add_line(p[2], p[3]),
-        lambda: space.add_arc(np.array(at) + turn @ [length / 2, 0], r, deg - 90, deg + 90),
-        lambda: space.add_arc(np.array(at) - turn @ [length / 2, 0], r, deg + 90, deg + 270),
-    ]
-    for k in rng.permutation(4):
-        pieces[k]()
-
-
 @pytest.mark.parametrize("seed", range(20))
 def test_areas_centroids_and_inertias_are_those_of_closed_forms(seed, tmp_path):
-    rng = np.random.default_rng(seed)
-    (file, space), at, kind = document(), rng.uniform(-500, 500, 2), seed % 4
-    if kind == 0:  # a bar with round ends, by bulges or by loose lines and arcs
-        length, r, angle = rng.uniform(60, 200), rng.uniform(15, 30), rng.uniform(0, 2 * np.pi)
-        add_slot(space, length, r, at, angle, seed % 8 == 0, rng)
-        outer, along = slot(length, r, at, angle), np.array([np.cos(angle), np.sin(angle)])
-        places = [at - along * length / 2, at + along * length / 2]
-    elif kind == 1:  # a rectangle with bulged sides
-        a, b, bulge = rng.uniform(80, 120), rng.uniform(50, 70), rng.uniform(0.001, 0.9)
-        corners = at + 0.5 * np.array([[-a, -b], [a, -b], [a, b], [-a, b]])
-        order = corners if seed % 8 == 1 else corners[::-1]
-        sign = 1 if seed % 8 == 1 else -1
-        space.add_lwpolyline([(*p, sign * bulge) for p in order], format="xyb", close=True)
-        outer, angle = [(1, rectangle(a, b, at))], 4 * np.arctan(bulge)
-        for k, (side, off) in enumerate(((b, a / 2), (a, b / 2), (b, a / 2), (a, b / 2))):
-            R, turn = side / (2 * np.sin(angle / 2)), k * np.pi / 2
-            way = np.array([np.cos(turn), np.sin(turn)])
-            outer.append((1, segment(R, angle, at + way * (off - R * np.cos(angle / 2)), turn)))
-        outer, places = combined(outer), [at - [a / 3, 0], at + [a / 3, 0]]
-    elif kind == 2:  # an ellipse
-        a, b = rng.uniform(60, 90), rng.uniform(30, 50)
-        space.add_ellipse(at, major_axis=(a, 0), ratio=b / a)
-        outer, places = (np.pi * a * b, at, (a**2 + b**2) / 4), [at - [a / 2, 0], at + [a / 2, 0]]
-    else:  # a disc
-        r = rng.uniform(50, 100)
-        space.add_circle(at, r)
-        outer, places = disc(r, at), [at - [r / 2, 0], at + [r / 2, 0]]
-    radii, parts = rng.uniform(3, 8, 2), [(1, outer)]
-    for place, radius in zip(places, radii, strict=True):
-        space.add_circle(place, radius)
-        parts.append((-1, disc(radius, place)))
-    add_slot(space, 8.0, 2.0, at, 0.3, seed % 2 == 0, rng)
-    area, centre, square = combined([*parts, (-1, slot(8.0, 2.0, at, 0.3))])
-    found = read(file, tmp_path)
-    assert found.area == pytest.approx(area * MM**2, rel=1e-12)
-    np.testing.assert_allclose(found.centroid, centre * MM, rtol=0, atol=1e-12 * (np.sqrt(area) + np.abs(at).max()) * MM)
-    assert found.square_radius == pytest.approx(square * MM**2, rel=1e-12)
+    wanted = profile(seed)
+    found = read(wanted.file, tmp_path)
+    assert max(wanted.errors(found)) < 1e-12
     assert len(found.holes) == 3 and len(found.circles) == 2
-    want = sorted(zip(places, radii, strict=True), key=lambda x: tuple(x[0]))
+    want = sorted(zip(wanted.places, wanted.radii, strict=True), key=lambda x: tuple(x[0]))
     for circle, (place, radius) in zip(found.circles, want, strict=True):
         np.testing.assert_allclose([*circle.centre, circle.radius], np.array([*place, radius]) * MM, rtol=1e-12)
     assert "round hole" in repr(found)
