@@ -270,9 +270,9 @@ def headline(data: xarray.Dataset) -> str:
         f"{float(off[trusted].max()):.2g} deviations, others {others:.2g}; "
         f"yields: {yields}; 105 gaps at 720 positions: {value('gaps, CPU (ms)'):.0f} ms CPU; "
         f"{data.sizes['linkage']} random linkages, {int(gap.sel(what='pairs').sum())} pairs: smallest gap of shapely "
-        f"{-float(gap.sel(what='below').max()):.1g} above the proven one, relative to the size; {data.sizes['touch']} contacts: {float(data.contact.max()):.1g} rad; "
-        f"slopes {float(data.slope.max()):.1g}; {data.sizes['drawing']} drawings: layers "
-        f"{shown}, as enumerated; {data.sizes['profile']} outlines off by at most "
+        f"{-float(gap.sel(what='below').max()):.1g} above the proven one, relative to the size; "
+        f"{data.sizes['touch']} contacts: {float(data.contact.max()):.1g} rad; slopes {float(data.slope.max()):.1g}; "
+        f"{data.sizes['drawing']} drawings: layers {shown}, as enumerated; {data.sizes['profile']} outlines off by at most "
         f"{float(data.outline.max()):.1g}"
     )
 
