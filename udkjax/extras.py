@@ -20,6 +20,7 @@ EXTRAS = {
     "optax": "identify",
     "pandas": "io",
     "starlette": "studio",
+    "svgelements": "svg",
     "tomlkit": "studio",
     "tyro": "cli",
     "uvicorn": "studio",

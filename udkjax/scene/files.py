@@ -9,6 +9,7 @@ from udkjax.scene.drawing import Drawing
 from udkjax.scene.drawing.drawing_tables import drawing_of_tables, drawing_text
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.mechanism_tables import is_xml, parse_toml
+from udkjax.scene.outlines.outline_tables import with_outlines
 from udkjax.scene.tables.checks import SceneError
 from udkjax.wording import abbreviate
 
@@ -17,6 +18,8 @@ DRAWN_VERSION = 2  # version of the format of drawings, with pins and links
 
 def load(path: str | os.PathLike[str]) -> Mechanism:
     """Read a mechanism from a TOML file of format 1, a drawing of format 2, or an MJCF model (as `read_mjcf`).
+
+    Outlines of links in other files are read from the folder of the file.
 
     Args:
         path: The file; if it begins like XML, it is read as MJCF.
@@ -35,7 +38,7 @@ def load(path: str | os.PathLike[str]) -> Mechanism:
 
 
 def loads(text: str) -> Mechanism:
-    """Read a mechanism from the text of a file, as `load` does.
+    """Read a mechanism from the text of a file, as `load` does; outlines in other files from the current folder.
 
     Args:
         text: The text.
@@ -109,7 +112,7 @@ def _read(text: str, source: str) -> Mechanism:
     if version == tables.FORMAT_VERSION and version is not True:
         return tables.mechanism_of_tables(scene, source)
     if version == DRAWN_VERSION:
-        return drawing_of_tables(scene, source).mechanism()
+        return drawing_of_tables(with_outlines(scene, source), source).mechanism()
     if version is None:
         formats = (
             f"write format = {DRAWN_VERSION} for a drawing, with pins, or format = {tables.FORMAT_VERSION} for bodies and joints"

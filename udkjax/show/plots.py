@@ -224,6 +224,7 @@ def _outlines(mech: Mechanism, q: Float[np.ndarray, "T bodies 3"]) -> Iterator[t
     for mark in marks(mech, q):
         if mark["kind"] in (MarkKind.LINK, MarkKind.OUTLINE):
             yield mark["body"], np.add(mark["points"], mark.get("at", (0.0, 0.0))), mark.get("closed", True)
+            yield from ((mark["body"], np.asarray(hole), True) for hole in mark.get("holes", ()))
         elif mark["kind"] in (MarkKind.WHEEL, MarkKind.DISC):
             yield mark["body"], np.add(mark["at"], mark["radius"] * _CIRCLE), True
 

@@ -103,13 +103,103 @@ def test_mistakes_name_the_contour_and_the_place(case, tmp_path):
 def test_a_file_without_unit_is_asked_for_it(tmp_path):
     file, space = document(0)
     space.add_circle((0, 0), 5)
-    with pytest.raises(udk.SceneError, match='no unit of length in its header; give it, unit="mm"'):
+    with pytest.raises(udk.SceneError, match='no unit of length; give it, unit="mm"'):
         read(file, tmp_path)
     assert read(file, tmp_path, unit="in").area == pytest.approx(np.pi * (5 * 0.0254) ** 2, rel=1e-13)
     with pytest.raises(udk.SceneError, match="unit: "):
         read(file, tmp_path, unit="kg")
-    with pytest.raises(udk.SceneError, match=r"must be a file \.dxf"):
+    with pytest.raises(udk.SceneError, match=r"must be a file \.dxf or \.svg"):
         udk.read_outline(tmp_path / "link.step")
     (tmp_path / "damaged.dxf").write_text("0\nSECTION\n2\nHEADER\nnonsense\n")
     with pytest.raises(udk.SceneError, match="not a DXF file that can be read"):
         udk.read_outline(tmp_path / "damaged.dxf")
+
+
+def svg(tmp_path, body, size='width="200mm" height="100mm" viewBox="0 0 200 100"', **options):
+    pytest.importorskip("svgelements")
+    (tmp_path / "link.svg").write_text(f'<svg xmlns="http://www.w3.org/2000/svg" {size}>{body}</svg>')
+    return udk.read_outline(tmp_path / "link.svg", **options)
+
+
+def test_svg_files_have_the_areas_of_closed_forms(tmp_path):
+    bar = '<path d="M20,30 h100 a20,20 0 0 1 0,40 h-100 a20 20 0 0 1 0,-40 z"/>'
+    holes = '<circle cx="20" cy="50" r="5"/><circle cx="120" cy="50" r="8"/><ellipse cx="70" cy="45" rx="10" ry="4"/>'
+    found = svg(tmp_path, f'<g transform="rotate(30 50 50) translate(3 4)">{bar}{holes}</g>')
+    turn = np.array([[np.cos(np.pi / 6), -np.sin(np.pi / 6)], [np.sin(np.pi / 6), np.cos(np.pi / 6)]])
+    at = lambda x, y: (np.array([50, 50]) + turn @ (np.array([x + 3, y + 4]) - 50)) * [1, -1]  # noqa: E731
+    area, centre, square = combined(
+        [(1, slot(100, 20, at(70, 50), 0)), (-1, disc(5, at(20, 50))), (-1, disc(8, at(120, 50)))]
+        + [(-1, (np.pi * 40, at(70, 45), (10**2 + 4**2) / 4))]
+    )
+    assert found.area == pytest.approx(area * MM**2, rel=1e-12) and found.square_radius == pytest.approx(
+        square * MM**2, rel=1e-12
+    )
+    np.testing.assert_allclose(found.centroid, centre * MM, rtol=1e-12)
+    np.testing.assert_allclose([c.centre for c in found.circles], [at(20, 50) * MM, at(120, 50) * MM], rtol=1e-11)
+    curve = svg(tmp_path, '<path d="M0,0 C0,1 1,1 1,0 z"/>', "", unit="m")
+    assert curve.area == pytest.approx(0.6, rel=1e-13) and curve.centroid[1] < 0
+    half = svg(tmp_path, '<path d="M0,0 Q1,2 2,0 z"/>', "", unit="m")
+    assert half.area == pytest.approx(4 / 3, rel=1e-13)
+
+
+def test_mistakes_in_svg_files_are_named(tmp_path):
+    with pytest.raises(udk.SceneError, match='no unit of length; give it, unit="mm"'):
+        svg(tmp_path, '<circle r="5"/>', 'width="200" height="100"')
+    with pytest.raises(udk.SceneError, match=r"contour 1 \(path 'arm'\) is open at \(10, -5\) mm"):
+        svg(tmp_path, '<path id="arm" d="M0,0 L10,0 L10,5"/>')
+    with pytest.raises(udk.SceneError, match="layers: those of a DXF file"):
+        svg(tmp_path, '<circle r="5"/>', layers=["cut"])
+    with pytest.raises(udk.SceneError, match="not an SVG file that can be read"):
+        svg(tmp_path, "<circle")
+
+
+SCENE = """format = 2
+units = {length = "mm"}
+ground = ["O"]
+link = [{name = "arm", pins = ["O", "A"], %s}]
+motor = [{pin = "O", speed = "60 rpm"}]
+[pins]
+O = [0, 0]
+A = [100, 0]
+"""
+
+
+def scene_with(tmp_path, arm):
+    file, space = document()
+    add_slot(space, 100.0, 10.0, (50.0, 0.0), 0.0, True, None)
+    for x in (0.0, 100.0):
+        space.add_circle((x, 0.0), 3.0 + x / 100)
+    file.saveas(tmp_path / "arm.dxf")
+    (tmp_path / "scene.toml").write_text(SCENE % arm)
+    return udk.load(tmp_path / "scene.toml")
+
+
+@pytest.mark.parametrize("outline", ['"arm.dxf"', '{file = "arm.dxf", unit = "mm", layers = ["0"], chord = 0.002}'])
+def test_a_scene_names_the_file_of_an_outline(outline, tmp_path):
+    mech = scene_with(tmp_path, f"density = 7850, thickness = 5, outline = {outline}")
+    area, centre, square = combined([(1, slot(100, 10, (50, 0), 0)), (-1, disc(3, (0, 0))), (-1, disc(4, (100, 0)))])
+    mass, link = 7850 * 5e-3 * area * MM**2, mech.drawing.links["arm"]
+    assert float(mech.bodies["arm"].mass) == pytest.approx(mass, rel=1e-12)
+    assert float(mech.bodies["arm"].inertia) == pytest.approx(mass * square * MM**2, rel=1e-12)
+    np.testing.assert_allclose(mech.bodies["arm"].position, centre * MM, atol=1e-14)
+    drawn = link.shape({})  # of the polygons alone
+    assert drawn.area == pytest.approx(area * MM**2, rel=1e-3) and drawn.square_radius == pytest.approx(square * MM**2, rel=1e-3)
+    again = udk.loads(udk.dumps(mech))
+    for name, value in mech.parameters().items():
+        np.testing.assert_array_equal(value, again.parameters()[name])
+    symbols = udk.animate(mech, udk.kinematics(mech, None, [0.0, 0.1])).data["runs"][0]["symbols"]
+    assert sum(x["fill"] == "back" and len(x.get("points", ())) > 12 for x in symbols) == 2
+
+
+def test_mistakes_of_named_outlines_are_listed(tmp_path):
+    for arm, message in {
+        'outline = "arm.dxf"': r'link\[0\] "arm": needs a mass, or a density and a thickness',
+        'mass = 1, outline = "amr.dxf"': r"outline: amr.dxf: .*No such file",
+        'mass = 1, outline = {fle = "arm.dxf"}': r'outline\.fle: unknown key; did you mean "file"',
+        'mass = 1, outline = {unit = "mm"}': "needs the name of a file",
+        'mass = 1, outline = {file = "arm.dxf", unit = "in"}': 'the file\'s unit is "mm"',
+        "mass = 1, width = 9, holes = [[[1, 0], [2, 0], [2, 1]]]": "a link without an outline has no holes",
+        "mass = 1, outline = [[0, 0], [9, 0], [9, 9]], holes = [[[20, 1], [1, 0], [2, 0]]]": r"holes\[0\]: lies outside",
+    }.items():
+        with pytest.raises(udk.SceneError, match=message):
+            scene_with(tmp_path, arm)

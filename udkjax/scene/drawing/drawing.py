@@ -233,6 +233,15 @@ class Drawing(AbstractDrawing):
             shapes[name] = number([placement.local(name, position) for position in positions])
         return shapes
 
+    def holes(self) -> dict[str, Array]:
+        """Return the corners of the holes (holes, corners, 2) of links that have any, in the frame of the link (m), by name."""
+        placement, found = placement_of(self.groups, self.ground), {}
+        for name, link in placement.links.items():
+            if link.holes is not None:
+                corners = [[placement.local(name, corner) for corner in hole] for hole in by_numpy(link.holes)]
+                found[name] = number(corners)
+        return found
+
     def free_pins(self) -> dict[str, tuple[str, Array]]:
         """Return the pins that belong to a single link, by name: the link, and the position in its frame (m)."""
         placement, free = placement_of(self.groups, self.ground), {}

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -65,6 +65,16 @@ def polygon(points: PointArray) -> Shape:
     return Shape(0.5 * xp.abs(twice), middle + centre, moment - centre @ centre)
 
 
+def pierced(whole: Shape, holes: Sequence[PointArray]) -> Shape:
+    """Return a shape without the polygons of its holes."""
+    parts = [whole, *(polygon(points)._replace(area=-polygon(points).area) for points in holes)]
+    area: Any = sum(part.area for part in parts)
+    centre: Any = sum(part.area * part.centre for part in parts) / area
+    arms = [part.centre - centre for part in parts]
+    moment: Any = sum(part.area * (part.square_radius + arm @ arm) for part, arm in zip(parts, arms, strict=True))
+    return Shape(area, centre, moment / area)
+
+
 def twice_area(points: PointArray) -> Number:
     """Return twice the area of a polygon (m^2), negative if its points are in clockwise order."""
     return array_namespace(points).sum(_next_and_cross(points - points[0])[1])
@@ -92,7 +102,8 @@ class Link(PrintsLine):
         mass: in kg.
         inertia: about the centre (kg m^2).
         centre: of mass, in world coordinates (m).
-        outline: corners of the polygon, in world coordinates (m).
+        outline: corners of the polygon, in world coordinates (m); in files also the name of a DXF or SVG file.
+        holes: corners of holes in the outline, in world coordinates (m), the same number for each; corners may be repeated.
     """
 
     pins: tuple[str, ...] = eqx.field(static=True, converter=given_names, metadata=PIN)
@@ -103,6 +114,7 @@ class Link(PrintsLine):
     inertia: Float[Array, ""] | None = eqx.field(converter=given_or_none, default=None, metadata=POSITIVE)  # kg m^2
     centre: Float[Array, "2"] | None = eqx.field(converter=given_or_none, default=None)  # m, world
     outline: Float[Array, "n 2"] | None = eqx.field(converter=given_or_none, default=None, metadata=OUTLINE)  # m, world
+    holes: Float[Array, "holes corners 2"] | None = eqx.field(converter=given_or_none, default=None)  # m, world
 
     @property
     def kind(self) -> str:
@@ -123,7 +135,7 @@ class Link(PrintsLine):
         """Return the link's shape, given the positions of the pins. A disc needs a width; a bar without one is a thin rod."""
         width = 0.0 if self.width is None else by_numpy(self.width)
         if self.outline is not None:
-            return polygon(by_numpy(self.outline))
+            return pierced(polygon(by_numpy(self.outline)), [] if self.holes is None else list(by_numpy(self.holes)))
         if self.kind == "disc":
             return disc(places[self.pins[0]], width)
         if self.kind == "bar":

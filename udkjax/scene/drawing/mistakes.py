@@ -213,6 +213,8 @@ def _shape_mistakes(places: Mapping[str, PointArray], link: Link) -> Iterator[st
     if link.inertia is not None and link.centre is not None and link.mass is not None and link.outline is None:
         return  # such a link needs no shape
     points = [places[pin] for pin in link.pins]
+    if link.holes is not None and link.outline is None:
+        yield ".holes: a link without an outline has no holes"
     if link.kind == "bar" and len(points) > 2:
         start, axis = points[0], points[-1] - points[0]
         for pin, point in list(zip(link.pins, points, strict=True))[1:-1]:
@@ -232,17 +234,19 @@ def _shape_mistakes(places: Mapping[str, PointArray], link: Link) -> Iterator[st
             yield f".{key}: the corners lie on one line, and enclose no area{cure}"
         elif key == "outline" and not any(_reaches(corners, point) for point in points):
             yield f".outline: crosses none of the pins {', '.join(map(quote, link.pins))}"
+        for k, hole in enumerate([] if link.holes is None else np.asarray(link.holes)):
+            if not _reaches(corners, hole[0]):
+                yield f".holes[{k}]: lies outside of the outline"
 
 
 def _crosses_itself(corners: np.ndarray) -> bool:
-    sides = [*pairwise(corners), (corners[-1], corners[0])]
+    (ax, ay), (bx, by) = corners.T[:, :, None], np.roll(corners, -1, axis=0).T[:, :, None]
 
-    def side(p: np.ndarray, q: np.ndarray, r: np.ndarray) -> float:
-        return np.sign((q[0] - p[0]) * (r[1] - p[1]) - (q[1] - p[1]) * (r[0] - p[0]))
+    def side(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        return np.sign((bx - ax) * (y.T - ay) - (by - ay) * (x.T - ax))
 
-    return any(
-        side(a, b, c) * side(a, b, d) < 0 and side(c, d, a) * side(c, d, b) < 0 for (a, b), (c, d) in combinations(sides, 2)
-    )
+    parted = side(ax, ay) * side(bx, by) < 0  # the ends of side k are on both sides of the line of side i
+    return bool((parted & parted.T).any())
 
 
 def _reaches(corners: np.ndarray, point: PointArray) -> bool:

@@ -141,6 +141,10 @@ class AbstractDrawing(PrintsTable):
     def shapes(self) -> dict[str, Array]:
         """Return the points (n, 2) through which each body is drawn, in the frame of the body (m), by name."""
 
+    @abstractmethod
+    def holes(self) -> dict[str, Array]:
+        """Return the corners of the holes (holes, n, 2) of bodies that have any, in the frame of the body (m), by name."""
+
     @property
     @abstractmethod
     def polygons(self) -> list[str]:

@@ -55,6 +55,7 @@ _FIELDS = {
     "thickness": "m",
     "centre": "m",
     "outline": "m",
+    "holes": "m",
     "direction": "rad",
     "speed": "rad/s",
     "force": "N",

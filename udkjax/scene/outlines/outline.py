@@ -15,6 +15,7 @@ from udkjax.scene.numbers.units import conversion_factor
 from udkjax.scene.outlines.contours import Contour, DrawnPiece, contains, contours_of
 from udkjax.scene.outlines.curves import Arc, Bezier, moments
 from udkjax.scene.outlines.dxf import read_dxf
+from udkjax.scene.outlines.svg import read_svg
 from udkjax.scene.tables.checks import SceneError
 from udkjax.wording import quote
 
@@ -63,6 +64,13 @@ class Outline(NamedTuple):
             require_number("chord", chord, "positive")
         return self.outer.polygon(CHORD * float(np.sqrt(self.area)) if chord is None else float(chord))
 
+    def hole_polygons(self, chord: float | None = None) -> Float[np.ndarray, "holes n 2"] | None:
+        """Return corners (m) of the holes, the same number for each, some of them repeated; None without any."""
+        chord = CHORD * float(np.sqrt(self.area)) if chord is None else float(chord)
+        found = [hole.polygon(chord) for hole in self.holes]
+        most = max(map(len, found), default=0)
+        return np.stack([np.append(x, np.repeat(x[-1:], most - len(x), 0), 0) for x in found]) if found else None
+
     def link(
         self,
         pins: Sequence[str],
@@ -87,7 +95,14 @@ class Outline(NamedTuple):
         if (mass is None) == (density is None) or (density is None) != (thickness is None):
             raise ArgumentError("give mass, or density and thickness")
         m = float(mass) if mass is not None else float(density or 0) * float(thickness or 0) * self.area
-        return Link(pins, mass=m, inertia=m * self.square_radius, centre=self.centroid, outline=self.polygon(chord))
+        return Link(
+            pins,
+            mass=m,
+            inertia=m * self.square_radius,
+            centre=self.centroid,
+            outline=self.polygon(chord),
+            holes=self.hole_polygons(chord),
+        )
 
     def _table(self) -> PrintedTable:
         size = float(np.sqrt(self.area))
@@ -104,15 +119,17 @@ class Outline(NamedTuple):
 
 
 def read_outline(path: str | os.PathLike[str], unit: str | None = None, layers: Sequence[str] | None = None) -> Outline:
-    """Return the outline that a DXF file draws: one closed contour of lines, arcs, ellipses, splines and bulges, with its holes.
+    """Return the outline that a DXF or SVG file draws: one closed contour of lines, arcs and splines, with its holes.
 
     Area, centroid and inertia are exact up to rounding. Pieces may be drawn in any order and direction; ends nearer than 1e-6 of
     the drawing's size meet.
 
     Args:
-        path: the file; reading it needs ezdxf (extra `dxf`).
-        unit: the unit of the file, such as "mm", if its header has none; otherwise it must be that of the header.
-        layers: the names of the layers that have contours; by default all.
+        path: the file; reading it needs ezdxf (extra `dxf`) or svgelements (extra `svg`). The y axis of an SVG file is turned
+            up.
+        unit: the unit of the file, such as "mm", if it has none; otherwise it must be that of the file: of the header of a DXF
+            file, mm for an SVG file whose width has a unit.
+        layers: the names of the layers of a DXF file that have contours; by default all.
 
     Returns:
         The `Outline`.
@@ -127,15 +144,18 @@ def read_outline(path: str | os.PathLike[str], unit: str | None = None, layers: 
         require_text("unit", unit)
     if layers is not None:
         require_names("layers", layers)
-    if Path(path).suffix.lower() != ".dxf":
-        raise SceneError([f"{quote(name)} must be a file .dxf"], name)
-    drawn, own, problems = read_dxf(path, None if layers is None else tuple(layers))
+    suffix = Path(path).suffix.lower()
+    if suffix not in (".dxf", ".svg"):
+        raise SceneError([f"{quote(name)} must be a file .dxf or .svg"], name)
+    if suffix == ".svg" and layers is not None:
+        raise SceneError(["layers: those of a DXF file; leave out other shapes of an SVG file"], name)
+    drawn, own, problems = read_svg(path) if suffix == ".svg" else read_dxf(path, None if layers is None else tuple(layers))
     if problems and not drawn:
         raise SceneError(problems, name)
     if unit is None and own is None:
-        problems.append('the file has no unit of length in its header; give it, unit="mm"')
+        problems.append('the file has no unit of length; give it, unit="mm"')
     elif unit is not None and own is not None and unit != own:
-        problems.append(f"the file's unit is {quote(own)}, not {quote(unit)}; leave out unit, or mend the header of the file")
+        problems.append(f"the file's unit is {quote(own)}, not {quote(unit)}; leave out unit, or mend the file")
     problems += [] if drawn else ["there are no lines, arcs or other curves" + (f" in the layers {layers}" if layers else "")]
     if problems:
         raise SceneError(problems, name)

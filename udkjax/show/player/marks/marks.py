@@ -76,6 +76,8 @@ class _Drawing:
         drawn = {} if mechanism.drawing is None else mechanism.drawing.shapes()
         polygons = () if mechanism.drawing is None else mechanism.drawing.polygons
         self.polygons = {body: np.asarray(drawn[body], float) for body in polygons if body not in shapes}
+        holes = {} if mechanism.drawing is None else mechanism.drawing.holes()
+        self.holes = {body: np.asarray(x, float).tolist() for body, x in holes.items() if body not in shapes}
         self._names = [*mechanism.bodies, GROUND]  # by index, -1 for the ground
         self.number = {GROUND: -1, **{body: k for k, body in enumerate(mechanism.bodies)}}
         self.points = body_points(mechanism)
@@ -112,6 +114,7 @@ class _Drawing:
             if len(points) > 1:
                 corners, closed = corners_of(points, self.polygons.get(body))
                 found.append({"kind": MarkKind.LINK, "body": k, "points": corners.tolist(), "closed": closed})
+                found[-1] |= {"holes": self.holes[body]} if body in self.holes else {}
             if len(self.points[body]) < 2 and body not in self.shaped and not rod:
                 radius = min(np.sqrt(inertia / mass), self.size / 4)
                 found.append({"kind": MarkKind.DISC, "body": k, "at": [0.0, 0.0], "radius": radius})

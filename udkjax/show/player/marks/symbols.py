@@ -76,6 +76,8 @@ def _link(mark: Mark, unit: float) -> Iterator[Symbol]:
     body, closed = mark["body"], mark["closed"]
     for width, colour in ((11, _edge(body)), (8, _tint(body))):
         yield _line([body, 0, 0, 0, 1], mark["points"], colour, width, colour if closed else "", closed)
+    for hole in mark.get("holes", ()):
+        yield _line([body, 0, 0, 0, 1], hole, _edge(body), 1.3, "back", True)
 
 
 def _disc(mark: Mark, unit: float) -> Iterator[Symbol]:
