@@ -25,7 +25,6 @@ SLOW: set[str] = {
     "spread",
     "atlas",
     "curves",
-    "made",
     "posteriors",
     "properties",  # a slice of it: tests/properties
 }
