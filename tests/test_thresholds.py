@@ -32,6 +32,7 @@ from udkjax.equations.rows.dense_rows import DenseRows
 from udkjax.equations.rows.redundancy import examine_rows
 from udkjax.integrate.solvers import method_of
 from udkjax.native.module.steps import LIMIT, STABLE
+from udkjax.study.tolerancing.dimensions import ToleratedNumbers
 
 pytestmark = pytest.mark.slow
 TIGHT: dict[str, Any] = {"rtol": 1e-9, "atol": 1e-9, "throw": False}
@@ -175,6 +176,38 @@ def rests() -> dict[str, Any]:
     return found | {"turns": turns.q, "efforts": efforts.without_friction / 10}
 
 
+def hidden_numbers() -> dict[str, Any]:
+    """Tolerances of which one number would hide another, and others that are independent, on several mechanisms."""
+    given = {
+        "four_bar": [("pin.C", "length(coupler)"), ("pin.A", "length(rocker)"), ("link.crank.mass", "length(crank)")],
+        "slider_crank": [("pin.P", "length(crank)"), ("pin.O", "length(rod)"), ("pin.B", "length(rod)")],
+        "n_four_bar": [("joint.A0.points[0]", "length(rod0)")],
+    }
+    found: dict[str, Any] = {}
+    for name, pairs in given.items():
+        mech = getattr(udk.library, name)()
+        for pair in pairs:
+            try:
+                ToleratedNumbers(mech, dict.fromkeys(pair, 1e-3))
+                found[f"{name}: {pair}"] = "independent"
+            except udk.SceneError:
+                found[f"{name}: {pair}"] = "one hides the other"
+    assert len(set(found.values())) == 2
+    return found
+
+
+def least_gaps() -> dict[str, Any]:
+    """Least gaps of four-bars whose crank turns or swings, with links that touch or do not: distances, values and contacts."""
+    found: dict[str, Any] = {}
+    for name, C, width in (("turns", (0.18, 0.0), 0.015), ("hits", (0.18, 0.0), 0.1), ("swings", (0.26, 0.0), 0.015)):
+        pins = {"O": [0.0, 0.0], "A": [0.03, 0.04], "B": [0.16, 0.11], "C": list(C)}
+        links = {k: udk.Link(list(ends), mass=1.0, width=width) for k, ends in (("a", "OA"), ("b", "AB"), ("c", "BC"))}
+        motors = {"motor": {"pin": "O", "speed": 1.0}}
+        gaps = udk.gaps(udk.Drawing(pins=pins, links=links, ground=["O", "C"], motors=motors).mechanism())
+        found[name] = gaps.least.distance, [(x.begins, x.ceases) for x in gaps.contacts]
+    return found
+
+
 CASES: dict[str, tuple[Callable[[], dict[str, Any]], tuple[str, ...], float]] = {
     "FITS": (held_pins, ("equations.rows.stationary_rows.FITS",), 0.0),
     "SMALL": (held_pins, ("equations.rows.stationary_rows.SMALL",), 0.0),
@@ -217,6 +250,11 @@ CASES: dict[str, tuple[Callable[[], dict[str, Any]], tuple[str, ...], float]] = 
     "FEW_OPERATIONS": (rests, ("expressions.loops.float_loops.FEW_OPERATIONS",), 1e-9),
     "ROUNDS, of starts": (designs, ("synthesis.starts.ROUNDS",), 1e-6),
     "LEAST_FALL": (designs, ("synthesis.search.LEAST_FALL",), 1e-6),
+    "HIDES": (hidden_numbers, ("study.tolerancing.dimensions.HIDES",), 0.0),
+    **{
+        name: (least_gaps, (f"positions.gaps.{name}",), 1e-9)
+        for name in ("search.PROVEN", "search.OPENED", "search.BESIDE", "motion.FOLLOWED")
+    },
     "JAMMING_TIMES": (jams, ("integrate.causes.jamming.JAMMING_TIMES",), 0.0),
 }
 USUAL: dict[Any, Any] = {}
