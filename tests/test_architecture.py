@@ -69,7 +69,7 @@ CIRCLES = (
     "integrate integrate/causes integrate/events integrate/events/instant integrate/events/run",
     "native native/gpu native/host",
     "native/language native/language/elementary",
-    "scene scene/drawing scene/mjcf",
+    "scene scene/drawing scene/mjcf scene/outlines",
     "study study/diagnosis",
     "synthesis synthesis/complete",
 )

@@ -97,7 +97,7 @@ def compare_with_shapely(seed: int, positions: int) -> GapComparison:
 
 
 def contact_errors(seed: int) -> list[float]:
-    """Return the differences (rad) between contacts of a random linkage and roots of the gaps of shapely beside them."""
+    """Return the differences (rad) between contacts of a random linkage and roots of the gaps of shapely."""
     mech, values = random_linkage(seed)
     found = []
 
