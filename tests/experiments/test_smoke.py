@@ -25,6 +25,7 @@ SLOW: set[str] = {
     "spread",
     "atlas",
     "curves",
+    "made",
     "posteriors",
     "properties",  # a slice of it: tests/properties
 }
