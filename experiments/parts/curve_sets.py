@@ -75,10 +75,10 @@ def curves_of_mechanisms(count: int, rng: np.random.Generator) -> list[np.ndarra
         first = np.array([[1, *(links[1:] - rng.integers(1, 3, dyads - 1))]])
         second = np.where(rng.random((1, dyads)) < 0.5, 0, np.maximum(first - 2, 0) * (first > BASE + 1))
         at = positions(x, Topology(first, second, rng.choice([-1.0, 1.0], (1, dyads)), np.zeros(1, int)), theta, 0.0)
-        if np.abs(at.cosines).max() < np.cos(np.deg2rad(10.0)) and np.ptp(at.pin.real) > 0.1:
+        if np.abs(at.cosines).max() < np.cos(np.deg2rad(10.0)) and np.ptp(np.real(at.pin)) > 0.1:
             curves.append(_points(at.pin[0, :-1]))
     return curves
 
 
 def _points(z: np.ndarray) -> np.ndarray:
-    return np.stack([z.real, z.imag], 1)
+    return np.stack([np.real(z), np.imag(z)], 1)
