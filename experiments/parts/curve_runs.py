@@ -98,7 +98,7 @@ def check(design: CurveDesign, curve: np.ndarray) -> Result:
 def _links(design: CurveDesign) -> list[list[list[float]]]:
     """Return segments from the first pin of each link to its others, as drawn (m)."""
     pins = {name: np.asarray(place).tolist() for name, place in design.pins.items()}
-    links = design.drawing.links.values() if design.drawing else ()
+    links = design.drawing.links.values() if isinstance(design.drawing, udk.Drawing) else ()
     return [[pins[link.pins[0]], pins[name]] for link in links for name in link.pins[1:]][:SEGMENTS]
 
 
