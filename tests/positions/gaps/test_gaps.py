@@ -37,9 +37,9 @@ def by_directions(A, B):
         n = np.stack([np.cos(angle), np.sin(angle)], -1)
         return -supports(B, -n) - supports(A, n)
 
-    angles = np.linspace(0, 2 * np.pi, 721)
+    angles = np.linspace(0, 2 * np.pi, 720, endpoint=False)
     values = gap(angles)
-    near = [a for k, a in enumerate(angles[:-1]) if values[k] >= max(values[k - 1], values[(k + 1) % 720])]
+    near = [a for k, a in enumerate(angles) if values[k] >= max(values[k - 1], values[(k + 1) % 720])]
     best = sorted(near, key=lambda a: -gap(a))[:3]
     options = {"xatol": 1e-12}
     return max(
