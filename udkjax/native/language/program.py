@@ -5,12 +5,14 @@ Inputs and outputs are in memory, with the W lanes of each number contiguous.
 
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from udkjax.expressions import ScalarProgram
+from udkjax.expressions.scalars.program_pieces import Piece, pieces_of
 from udkjax.native.language import elementary
 from udkjax.native.language.ir import BOOL, DOUBLE, INT, POINTER, Function, Value, llvm_type
 
@@ -21,6 +23,7 @@ HALF_PI = tuple(
     map(float.fromhex, ("0x1.921fb40000000p+0", "0x1.4442d00000000p-24", "0x1.8469880000000p-48", "0x1.8cc51701b839ap-72"))
 )
 ROUND = 1.5 * 2.0**52  # added to a number, leaves the nearest integer in the last digits of the sum
+PASSED = "passed"  # the pointer to what the pieces of a long program pass on
 _ARITHMETIC = ("add", "sub", "mul", "div")
 _COMPARED = ("lt", "le", "gt", "ge", "eq", "ne")
 _INTRINSIC = {"abs": "fabs", "floor": "floor", "ceil": "ceil", "max": "maximum", "min": "minimum"}
@@ -51,15 +54,47 @@ def write(
     """Write a program as a function of some pointers; conditions are stored as one or zero.
 
     `lanes` has the widths of pointers to numbers of another width; results that depend only on single numbers are computed once.
+    A long program is a function that calls its pieces, one after another.
     """
-    f = Function(name, [(POINTER, x) for x in pointers], width, cold=cold)
-    writer, lanes = Writer(f, program), dict.fromkeys(pointers, width) | dict(lanes or {})
-    for s, (pointer, place) in zip(program.inputs, inputs, strict=True):
-        if program.uses(s):
-            x = f.load(f.given[pointer], place * lanes[pointer], lanes[pointer])
-            writer.values[s.index] = from_memory(f, x, s.node.dtype)
-    for value, (pointer, place) in zip(writer.run(), outputs, strict=True):
-        f.store(value, f.given[pointer], place * lanes[pointer], lanes[pointer])
+    lanes = dict.fromkeys(pointers, width) | dict(lanes or {})
+    places = {s.index: place for s, place in zip(program.inputs, inputs, strict=True) if program.uses(s)}
+    read = {*places.values()}
+    pieces, shared = pieces_of(program, [k for k, place in enumerate(outputs) if place in read])
+    widest = max(lanes.values(), default=width)
+    kinds: dict[int, tuple[str, int]] = {}  # the type and the lanes of values that pieces pass
+
+    def fill(f: Function, piece: Piece):
+        writer = Writer(f, program)
+        for s in program.inputs:
+            if s.index in piece.inputs:
+                pointer, place = places[s.index]
+                x = f.load(f.given[pointer], place * lanes[pointer], lanes[pointer])
+                writer.values[s.index] = from_memory(f, x, s.node.dtype)
+        for index, place in piece.received.items():
+            base, own = kinds[index]
+            x = f.load(f.given[PASSED], place * widest, own, DOUBLE if base == BOOL else base)
+            writer.values[index] = x.is_not(0.0) if base == BOOL else x
+        writer.compute(piece.order)
+        for index, place in piece.passed.items():
+            x = writer.values[index]
+            kinds[index] = x.base, x.width
+            f.store(x, f.given[PASSED], place * widest, x.width, DOUBLE if x.base == BOOL else x.base)
+        for value, k in zip(writer.outputs(piece.outputs), piece.outputs, strict=True):
+            pointer, place = outputs[k]
+            f.store(value, f.given[pointer], place * lanes[pointer], lanes[pointer])
+
+    arguments = [(POINTER, x) for x in pointers]
+    f = Function(name, arguments, width, cold=cold)
+    if len(pieces) == 1:
+        fill(f, pieces[0])
+        return f
+    f.given[PASSED] = Value(f, f.reserve(llvm_type(DOUBLE, widest), shared), POINTER)
+    for k, piece in enumerate(pieces):
+        part = Function(f"{name}_piece{k}", [*arguments, (POINTER, PASSED)], width, cold=cold)
+        part.noinline = True
+        fill(part, piece)
+        f.evaluated |= part.evaluated | {part.name: part}
+        f.call(part.name, *(f.given[x] for x in (*pointers, PASSED)))
     return f
 
 
@@ -86,14 +121,27 @@ class Writer:
 
     def run(self) -> list[Value]:
         """Write all operations; return the outputs."""
+        self.compute(self.program.order)
+        return self.outputs(range(len(self.program.outputs)))
+
+    @cached_property
+    def _uses(self) -> Counter[int]:
         nodes = self.program.graph.nodes
         used = Counter(s.index for index in self.program.order for s in nodes[index].arguments)
         used.update(s.index for s in self.program.outputs)
-        for index in self.program.order:
+        return used
+
+    def compute(self, order: Sequence[int]) -> None:
+        """Write some operations."""
+        nodes = self.program.graph.nodes
+        for index in order:
             self.values[index] = result = self._operation(nodes[index])
-            if used[index] > 1:  # fused with several sums, a product would occupy two registers instead of one
+            if self._uses[index] > 1:  # fused with several sums, a product would occupy two registers instead of one
                 result.product = None
-        return [self._with_sign(s) for s in self.program.outputs]
+
+    def outputs(self, chosen: Iterable[int]) -> list[Value]:
+        """Return the outputs with these indices, whose nodes have been written."""
+        return [self._with_sign(self.program.outputs[k]) for k in chosen]
 
     def check(self):
         """Write each operation that is not arithmetic, of any numbers: raise `UnsupportedError` if one is not supported."""
