@@ -205,6 +205,25 @@ def test_a_run_does_not_follow_the_positions_nearest_to_a_dead_point(tol, end):
     assert "dead point: pins B, D, E in line" in solution.cause
 
 
+class Bumper(udk.ForceElement):
+    """A force along x beyond an angle: a kink, at which steps of a run end."""
+
+    def loads(self, t, frame):
+        return [(-jnp.maximum(frame.angle - 9.0, 0.0), 0.0, 0.0)]
+
+
+@pytest.mark.parametrize("count", [3, 11])
+@pytest.mark.parametrize("tol", [1e-4, 1e-6, 1e-9])
+def test_a_run_with_kinks_ends_at_the_reach_of_its_driver_too(tol, count):
+    """The last output is closed, and the state that is open lies between it and the next."""
+    mech = four_bar(motor=[START, 2.0])
+    mech = udk.Mechanism(dict(mech.bodies), dict(mech.joints), dict(mech.drivers), {"bumper": Bumper("rocker")})
+    solution = failed(mech, np.linspace(0.0, 2.0, count), rtol=tol, atol=tol)
+    assert solution.settings["kinks"] == "located"
+    assert solution.result in (Result.drift, Result.step_too_small)
+    assert f"the linkage reaches {TOGGLE:.6g} rad" in solution.cause
+
+
 @pytest.mark.parametrize(
     ("values", "cause"),
     [

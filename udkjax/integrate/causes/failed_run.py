@@ -54,11 +54,17 @@ class FailedRun:
     def states(self) -> list[tuple[float, np.ndarray, np.ndarray]]:
         """The usable states (t, q, v), latest first: that of the integrator, then the outputs before the failure."""
         finite = np.isfinite(self.q).all(1) & np.isfinite(self.v).all(1)
-        good = [k for k in range(len(self.ts)) if finite[k] and (self.result != Result.drift or self.ts[k] < self.time)]
+        good = [k for k in range(len(self.ts)) if finite[k] and (self.ts[k] < self.time or not self._has_drifted(k))]
         listed = [(float(self.ts[k]), self.q[k], self.v[k]) for k in reversed(good)]
         if self.end is None or self.result == Result.drift or not all(np.all(np.isfinite(x)) for x in self.end):
             return listed
         return [self.end, *listed]
+
+    def _has_drifted(self, k: int) -> bool:
+        """Return whether an output is where the run was found to drift; that before it is closed."""
+        if self.result != Result.drift or self.ts[k] > self.time:
+            return self.result == Result.drift
+        return not np.max(np.abs(self.psi(self.ts[k], self.q[k])) / self.row_scales, initial=0.0) <= self.drift_tol
 
     def psi(self, t: float, q: np.ndarray) -> np.ndarray:
         """Return Psi (m,), in m or rad."""

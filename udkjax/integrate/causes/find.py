@@ -133,11 +133,16 @@ def _explain_drift(run: FailedRun) -> str | None:
     left_out = sorted({run.rows.names[i][0] for i in run.analysis.redundant_rows or ()})
     text = run.open_rows(run.time, q)
     anew = "analyse the mechanism with its present numbers, or use method=SVD()"
-    if not text:
-        return f"rows of {', '.join(left_out)} are left out as redundant, but are independent: {anew}"
-    reach = explain_reach(run, _shortly_after(run, run.time))
+    following = float(min(run.ts[run.ts > run.time], default=run.ts[-1]))
+    # The last output is closed where the step after it, or a row that is left out, is not.
+    reach = explain_reach(run, _shortly_after(run, run.time) if text else following)
     if reach:
         return reach
+    if not text and left_out:
+        return f"rows of {', '.join(left_out)} are left out as redundant, but are independent: {anew}"
+    if not text:
+        why = _near_singular(run) if run.states else ""
+        return f"the constraints open before {following:.6g} s: {why or 'tighten rtol and atol'}"
     size = float(np.max(np.abs(run.psi(run.time, q)) / run.row_scales))
     open_by = f"open (m, rad): {text}, {size:.2g} of the scene's scales, more than drift_tol={run.drift_tol:g}"
     if not run.is_projected:
