@@ -15,7 +15,7 @@ from udkjax.equations.states.textbook import TextbookEquations
 from udkjax.integrate.problem import Problem
 from udkjax.integrate.projection import violation
 from udkjax.integrate.solvers.counting import CountingController
-from udkjax.native.module.steps import Status
+from udkjax.native.module.steps import NEAR_SHARE, Status
 from udkjax.pinv import SVD
 from udkjax.pinv.auto import NEAREST
 from udkjax.transforms.gradients import stop_gradients
@@ -108,12 +108,12 @@ class DriftController(diffrax.AbstractAdaptiveStepSizeController):
         def measured(_: Array) -> Array:
             return jnp.maximum(distance(equations, t, y), distance(equations, *before))
 
-        is_small = size <= tol * NEAREST**2  # at any distance: most steps do not measure it
+        is_small = size <= tol * NEAR_SHARE * NEAREST**2  # at any distance: most steps do not measure it
         near = jax.lax.cond(keep & ~is_small, measured, lambda _: jnp.array(0.0), 0)
         farthest = jnp.where(keep, jnp.maximum(controller_state.farthest, near), controller_state.farthest)
         nearness = jnp.maximum(near, NEAREST) / jnp.maximum(farthest, NEAREST)
         status = jnp.where(size > tol, Status.LOST, Status.SINGULAR)
-        is_turned = keep & ~is_small & (size > tol * nearness**2)
+        is_turned = keep & ~is_small & (size > tol * nearness**2 * jnp.maximum(nearness, NEAR_SHARE))
         status = jnp.where(is_turned, status, controller_state.status)
         result = diffrax.RESULTS.where(is_turned, diffrax.RESULTS.dt_min_reached, result)
         return keep, *times, jumped, DriftState(inner, farthest, status), result

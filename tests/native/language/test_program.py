@@ -230,3 +230,39 @@ def test_whatever_has_an_instruction_has_derivatives_that_have_one(code, name):
         found = np.zeros(2)
         run(np.array([point]), found)
         assert_allclose(found, np.full(2, jax.grad(lambda x: SLOPED[name](x) * 1.0)(point)), rtol=1e-12, atol=1e-14)
+
+
+def test_a_long_program_is_a_chain_of_functions(code, width):
+    """Its pieces pass numbers of one lane and of all, also of more than the function has, and write over inputs at last only."""
+    graph, rng = Graph(), np.random.default_rng(0)
+
+    def long(x, y, c):
+        values = [x, y, c]
+        for k in range(150):
+            a, b = values[-1 - k % 7 % len(values)], values[int(rng.integers(len(values)))]
+            number = (
+                jnp.exp(-a * a) if k % 40 == 0 else jnp.where(b > a, 0.3 * a - b, a / (b * b + 2.0)) if k % 3 else c * c - 0.1 * k
+            )
+            values.append(number)
+        whole = jnp.where(x > y, 3, -2)
+        return x - sum(values[3::2]), sum(values[4::2]) * whole, jnp.where(values[5] > values[9], values[3], y)
+
+    scalars = [graph.input((name, 0), name) for name in "xyc"]
+    arrays = [np.array(s, object) for s in scalars]
+    outputs = [s for o in trace(long, 0.5, 0.25, 0.75)(graph, *arrays) for s in o.flat]
+    program = ScalarProgram(graph, scalars, outputs)
+    f = write(
+        program,
+        "program",
+        1,
+        ("x", "c"),
+        [("x", 0), ("x", 1), ("c", 0)],
+        [("x", 0), ("x", 1), ("x", 2)],
+        lanes={"x": width},
+        longest=100,
+    )
+    assert len([name for name in f.evaluated if name.startswith(f.name)]) > 3
+    x, c = np.append(rng.uniform(0.5, 1.5, 2 * width), np.zeros(width)), np.array([0.7])
+    exact = program.by_numpy([x[:width], x[width : 2 * width], np.full(width, c[0])])
+    code(f)(x, c)
+    assert_allclose(x.reshape(3, width), exact, rtol=1e-12)

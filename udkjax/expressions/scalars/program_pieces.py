@@ -1,6 +1,7 @@
 """A long scalar program in pieces: the time to compile one function grows faster than its length."""
 
 from collections.abc import Collection, Mapping, Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 from udkjax.expressions.scalars.scalar_program import ScalarProgram
@@ -37,7 +38,7 @@ def pieces_of(program: ScalarProgram, late: Collection[int] = (), longest: int =
     nodes, order = program.graph.nodes, program.order
     count = max(-(-len(order) // longest), 1)
     cuts = [len(order) * k // count for k in range(count + 1)]
-    parts = [order[a:b] for a, b in zip(cuts, cuts[1:], strict=False)]
+    parts = [order[a:b] for a, b in pairwise(cuts)]
     made = {index: k for k, part in enumerate(parts) for index in part if nodes[index].kind != "constant"}
     stored: list[list[int]] = [[] for _ in parts]
     last = len(parts) - 1

@@ -161,8 +161,8 @@ def _explain_singular(run: FailedRun) -> str:
     place = _nearest_singular(run)
     return (
         f"near a singular configuration{'' if place is None else f' of {place[0]}'} the constraints are open by {size:.1g} of "
-        "the scene's scales: the run may change its branch or lose its energy there (the bound is drift_tol times the square of "
-        f"the distance from it); {_nothing_projects(run)}"
+        "the scene's scales: the run may change its branch or lose its energy there (the bound is drift_tol / 4 times the square "
+        f"of the distance from it); {_nothing_projects(run)}"
     )
 
 

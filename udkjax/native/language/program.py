@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from udkjax.expressions import ScalarProgram
-from udkjax.expressions.scalars.program_pieces import Piece, pieces_of
+from udkjax.expressions.scalars.program_pieces import LONGEST, Piece, pieces_of
 from udkjax.native.language import elementary
 from udkjax.native.language.ir import BOOL, DOUBLE, INT, POINTER, Function, Value, llvm_type
 
@@ -50,20 +50,21 @@ def write(
     outputs: Sequence[PointerPlace],
     cold: bool = False,
     lanes: Mapping[str, int] | None = None,
+    longest: int = LONGEST,
 ) -> Function:
     """Write a program as a function of some pointers; conditions are stored as one or zero.
 
     `lanes` has the widths of pointers to numbers of another width; results that depend only on single numbers are computed once.
-    A long program is a function that calls its pieces, one after another.
+    A program of more than `longest` operations is a function that calls its pieces, one after another.
     """
     lanes = dict.fromkeys(pointers, width) | dict(lanes or {})
     places = {s.index: place for s, place in zip(program.inputs, inputs, strict=True) if program.uses(s)}
     read = {*places.values()}
-    pieces, shared = pieces_of(program, [k for k, place in enumerate(outputs) if place in read])
+    pieces, shared = pieces_of(program, [k for k, place in enumerate(outputs) if place in read], longest)
     widest = max(lanes.values(), default=width)
     kinds: dict[int, tuple[str, int]] = {}  # the type and the lanes of values that pieces pass
 
-    def fill(f: Function, piece: Piece):
+    def fill(f: Function, piece: Piece, passed: Value):
         writer = Writer(f, program)
         for s in program.inputs:
             if s.index in piece.inputs:
@@ -72,13 +73,13 @@ def write(
                 writer.values[s.index] = from_memory(f, x, s.node.dtype)
         for index, place in piece.received.items():
             base, own = kinds[index]
-            x = f.load(f.given[PASSED], place * widest, own, DOUBLE if base == BOOL else base)
+            x = f.load(passed, place * widest, own, DOUBLE if base == BOOL else base)
             writer.values[index] = x.is_not(0.0) if base == BOOL else x
         writer.compute(piece.order)
         for index, place in piece.passed.items():
             x = writer.values[index]
             kinds[index] = x.base, x.width
-            f.store(x, f.given[PASSED], place * widest, x.width, DOUBLE if x.base == BOOL else x.base)
+            f.store(x, passed, place * widest, x.width, DOUBLE if x.base == BOOL else x.base)
         for value, k in zip(writer.outputs(piece.outputs), piece.outputs, strict=True):
             pointer, place = outputs[k]
             f.store(value, f.given[pointer], place * lanes[pointer], lanes[pointer])
@@ -86,15 +87,15 @@ def write(
     arguments = [(POINTER, x) for x in pointers]
     f = Function(name, arguments, width, cold=cold)
     if len(pieces) == 1:
-        fill(f, pieces[0])
+        fill(f, pieces[0], f.const(0, INT))  # passes nothing on
         return f
-    f.given[PASSED] = Value(f, f.reserve(llvm_type(DOUBLE, widest), shared), POINTER)
+    passed = Value(f, f.reserve(llvm_type(DOUBLE, widest), shared), POINTER)
     for k, piece in enumerate(pieces):
         part = Function(f"{name}_piece{k}", [*arguments, (POINTER, PASSED)], width, cold=cold)
         part.noinline = True
-        fill(part, piece)
+        fill(part, piece, part.given[PASSED])
         f.evaluated |= part.evaluated | {part.name: part}
-        f.call(part.name, *(f.given[x] for x in (*pointers, PASSED)))
+        f.call(part.name, *(f.given[x] for x in pointers), passed)
     return f
 
 

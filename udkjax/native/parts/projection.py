@@ -6,7 +6,7 @@ from udkjax.native.language.ir import DOUBLE, Function, Value, Variable
 from udkjax.native.module.layout import Lane
 from udkjax.native.module.module import Module
 from udkjax.native.module.parts import ProjectionPart
-from udkjax.native.module.steps import CLOSED_TOL, LOST_TOL, OUTPUT_STEPS, ROUNDING_PIVOT, SINGLE_STEP_TOL, Status
+from udkjax.native.module.steps import CLOSED_TOL, LOST_TOL, NEAR_SHARE, OUTPUT_STEPS, ROUNDING_PIVOT, SINGLE_STEP_TOL, Status
 from udkjax.native.parts.elimination import EliminatedAccelerations
 from udkjax.native.parts.manifold import iterate_newton, largest_violation, newton, take_newton_step, with_threshold
 
@@ -52,9 +52,9 @@ class Unprojected(ProjectionPart):
 
         Where the distance from singular configurations is d, a violation x of Psi moves the state by x / d and turns its velocity
         by x / d^2: near the intersection of two branches, the curves of constant Psi are hyperbolas, and lead from one branch to
-        the other. Therefore the bound of x is `drift_tol` times d^2, with d relative to the largest distance of the run. Steps
-        that are short beside d follow such a curve, and a longer one passes: d is the distance of the farther end of the step. A
-        distance below which the method leaves rows out counts as this distance.
+        the other. Therefore the bound of x is `drift_tol` times d^2 max(d, NEAR_SHARE), with d relative to the largest distance
+        of the run. Steps that are short beside d follow such a curve, and a longer one passes: d is the distance of the farther
+        end of the step. A distance below which the method leaves rows out counts as this distance.
         """
         module = self._in
         nearest = module.accelerations.nearest(f, s)
@@ -62,7 +62,7 @@ class Unprojected(ProjectionPart):
         farther = f.max(s.distance, f.select(s.distance1 < np.inf, s.distance1, 0.0))
         nearness = f.max(farther, nearest) / f.max(s.farthest, nearest)
         violated, status = largest_violation(module, f), lambda code: f.const(float(code), DOUBLE, f.width)
-        is_turned = accept & (violated > s.drift_tol * (nearness * nearness))
+        is_turned = accept & (violated > s.drift_tol * (nearness * nearness * f.max(nearness, NEAR_SHARE)))
         return f.select(is_turned, f.select(violated > s.drift_tol, status(Status.LOST), status(Status.SINGULAR)), 0.0)
 
 
