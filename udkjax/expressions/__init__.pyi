@@ -40,6 +40,9 @@ from udkjax.expressions.scalars.graph import Scalar as Scalar
 from udkjax.expressions.scalars.kinks import has_kinks as has_kinks
 from udkjax.expressions.scalars.kinks import may_have_kinks as may_have_kinks
 from udkjax.expressions.scalars.kinks import smooth_pieces as smooth_pieces
+from udkjax.expressions.scalars.program_pieces import LONGEST as LONGEST
+from udkjax.expressions.scalars.program_pieces import ProgramPiece as ProgramPiece
+from udkjax.expressions.scalars.program_pieces import pieces_of as pieces_of
 from udkjax.expressions.scalars.scalar_program import ScalarProgram as ScalarProgram
 from udkjax.expressions.scalars.scalar_program import frontier as frontier
 from udkjax.expressions.scalars.scalar_program import operations as operations

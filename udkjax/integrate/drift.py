@@ -15,9 +15,9 @@ from udkjax.equations.states.textbook import TextbookEquations
 from udkjax.integrate.problem import Problem
 from udkjax.integrate.projection import violation
 from udkjax.integrate.solvers.counting import CountingController
-from udkjax.native.module.steps import NEAR_SHARE, Status
+from udkjax.native.module.steps import Status
 from udkjax.pinv import SVD
-from udkjax.pinv.auto import NEAREST
+from udkjax.pinv.auto import NEAR_SHARE, NEAREST
 from udkjax.transforms.gradients import stop_gradients
 
 DEPENDENT = np.finfo(float).eps ** 0.5  # distance at or below which rows are dependent: eigenvalues are its square, with rounding

@@ -1,6 +1,7 @@
 """The door of `pinv`: the names that floors above import, each from its own module."""
 
 from udkjax import pinv as pinv
+from udkjax.pinv.auto import NEAR_SHARE as NEAR_SHARE
 from udkjax.pinv.auto import NEAREST as NEAREST
 from udkjax.pinv.auto import Auto as Auto
 from udkjax.pinv.elimination import Elimination as Elimination

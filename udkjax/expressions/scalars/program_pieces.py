@@ -9,7 +9,7 @@ from udkjax.expressions.scalars.scalar_program import ScalarProgram
 LONGEST = 4_000  # operations of a piece; pieces of 2,000 run a tenth longer, and one of 20,000 takes LLVM twice as long as five
 
 
-class Piece(NamedTuple):
+class ProgramPiece(NamedTuple):
     """A part of a program that is computed at once."""
 
     order: Sequence[int]
@@ -19,12 +19,12 @@ class Piece(NamedTuple):
     received: Mapping[int, int]
     """The nodes that earlier pieces have computed, with their places in the memory that pieces share."""
     passed: Mapping[int, int]
-    """The nodes that later pieces read, likewise."""
+    """The nodes that later pieces read, with their places."""
     outputs: Sequence[int]
     """The indices of the outputs that it stores."""
 
 
-def pieces_of(program: ScalarProgram, late: Collection[int] = (), longest: int = LONGEST) -> tuple[list[Piece], int]:
+def pieces_of(program: ScalarProgram, late: Collection[int] = (), longest: int = LONGEST) -> tuple[list[ProgramPiece], int]:
     """Cut a program into pieces of equal length; constants are no values that pieces pass, as each piece writes its own.
 
     Args:
@@ -65,5 +65,5 @@ def pieces_of(program: ScalarProgram, late: Collection[int] = (), longest: int =
         free += [place for index, place in received.items() if until[index] == k]
         # Constants that an earlier piece has computed
         constants = [i for i in reads[k] if i not in made and i not in given and i not in {*part}]
-        pieces.append(Piece([*sorted(constants), *part], {i for i in reads[k] if i in given}, received, passed, stored[k]))
+        pieces.append(ProgramPiece([*sorted(constants), *part], {i for i in reads[k] if i in given}, received, passed, stored[k]))
     return pieces, size

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from udkjax.expressions import ScalarProgram
-from udkjax.expressions.scalars.program_pieces import LONGEST, Piece, pieces_of
+from udkjax.expressions.scalars.program_pieces import LONGEST, ProgramPiece, pieces_of
 from udkjax.native.language import elementary
 from udkjax.native.language.ir import BOOL, DOUBLE, INT, POINTER, Function, Value, llvm_type
 
@@ -64,7 +64,7 @@ def write(
     widest = max(lanes.values(), default=width)
     kinds: dict[int, tuple[str, int]] = {}  # the type and the lanes of values that pieces pass
 
-    def fill(f: Function, piece: Piece, passed: Value):
+    def fill(f: Function, piece: ProgramPiece, passed: Value):
         writer = Writer(f, program)
         for s in program.inputs:
             if s.index in piece.inputs:

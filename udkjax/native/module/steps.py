@@ -117,11 +117,6 @@ class Status:
 # time: a run would follow them by thousands of steps.
 CLOSED_TOL, LOST_TOL = 100.0, 1e-2
 
-# Near singular configurations a run that is not projected may violate Psi by this part of `drift_tol` times the square of the
-# distance (projection.py). Of 1,008 runs of a kite, a crank slider and a parallelogram with equal lengths, by three methods and
-# seven gains, ten took the wrong branch if they may violate Psi by the whole of it, and none by the half.
-NEAR_SHARE = 0.25
-
 LOOK_AHEAD = 1e-6  # fraction of the span after the end of a stopped run that is searched for non-finite numbers
 
 # Weight of the error component normal to the manifold. Projection removes this component, and only its effect within the step

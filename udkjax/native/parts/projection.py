@@ -6,9 +6,10 @@ from udkjax.native.language.ir import DOUBLE, Function, Value, Variable
 from udkjax.native.module.layout import Lane
 from udkjax.native.module.module import Module
 from udkjax.native.module.parts import ProjectionPart
-from udkjax.native.module.steps import CLOSED_TOL, LOST_TOL, NEAR_SHARE, OUTPUT_STEPS, ROUNDING_PIVOT, SINGLE_STEP_TOL, Status
+from udkjax.native.module.steps import CLOSED_TOL, LOST_TOL, OUTPUT_STEPS, ROUNDING_PIVOT, SINGLE_STEP_TOL, Status
 from udkjax.native.parts.elimination import EliminatedAccelerations
 from udkjax.native.parts.manifold import iterate_newton, largest_violation, newton, take_newton_step, with_threshold
+from udkjax.pinv.auto import NEAR_SHARE
 
 
 class Unprojected(ProjectionPart):
