@@ -12,8 +12,8 @@ from udkjax.pinv.svd import SVD, SVDFactors
 BRANCH_TOL = 1e-6
 NEAREST = BRANCH_TOL**0.5  # the distance from dependence below which elimination is not used
 # Near singular configurations a run that is not projected may violate Psi by this part of `drift_tol` times the square of the
-# distance (native/parts/projection.py). Of 1,008 runs of a kite, a crank slider and a parallelogram with equal lengths, by three methods and
-# seven gains, ten took the wrong branch if they may violate Psi by the whole of it, and none by the half.
+# distance (native/parts/projection.py). Of 1,008 runs of a kite, a crank slider and a parallelogram with equal lengths, by three
+# methods and seven gains, ten took the wrong branch if they may violate Psi by the whole of it, and none by the half.
 NEAR_SHARE = 0.25
 
 
