@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from udkjax.expressions.scalars.scalar_program import ScalarProgram
 
-LONGEST = 4_000  # operations of a piece; pieces of 2,000 run a tenth longer, and one of 20,000 takes LLVM twice as long as five
+LONGEST = 4_000  # operations of a piece; those of 2,000 run a tenth longer, and LLVM takes ten times as long for 26,000 in one
 
 
 class ProgramPiece(NamedTuple):
