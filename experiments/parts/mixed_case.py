@@ -11,18 +11,21 @@ import numpy as np
 from jaxtyping import Float
 
 import udkjax as udk
-from experiments.parts.mixed_scenes import build, events
+from experiments.parts.mixed_scenes import LEAST_RANK, build, events
 from experiments.parts.random_scenes import RandomScene, state_of
+from experiments.parts.reference_equations import evaluate
 from experiments.parts.tally import Tally
 
 SPAN, TIMES = 0.8, 9  # of a run, in the scene's own time, and its number of outputs
 LOOSE, MIDDLE, TIGHT = 1e-6, 1e-9, 1e-11  # tolerances of integration
-STEPS, EVENTS = 30_000, 300  # most of a run
+STEPS, EVENTS = 100_000, 300  # most of a run: where a damper is just too weak for implicit steps, explicit ones are 1/50,000 s
+ALONG, SINGULAR = 400, 0.02  # times along a run, and the smallest singular value, of the largest, near a change point
 DIFFERENCE = 1e-6  # allowed between two runs at MIDDLE, or GROWTH times what TIGHT changes, in scenes that amplify errors
 GROWTH = 30.0
 # Numbers that are varied and differentiated: they open no loop. Of a friction with a static coefficient this one alone.
 VARIED = re.compile(r"body\..*\.(mass|inertia)|force\..*\.(stiffness|damping|most|force|drag|torque|value|coefficient)")
 MOST_VARIED = 4
+ANY_JOINT = re.compile(r"^.* (?=sticks$)")
 
 
 class Failure(NamedTuple):
@@ -83,10 +86,29 @@ class Case:
         return max(1.0, GROWTH * difference(self.middle, self.tight) / DIFFERENCE)
 
     def check(self, name: str, error: float, detail: str = "") -> None:
-        """Count a comparison; list it if the error exceeds the property's tolerance."""
+        """Count a comparison; list it if the error exceeds the property's tolerance, unless no motion is definite."""
+        fails = not error <= self.tolerances[name]
+        if fails and self.is_indefinite:
+            self.tally.leave_out("friction by load at a change point, where loads have no bound (docs/limits.md)")
+            return
         self.tally.add(name, error, self.label)
-        if not error <= self.tolerances[name]:
+        if fails:
             self.failures.append(Failure(name, self.label, float(error), detail))
+
+    @functools.cached_property
+    def is_indefinite(self) -> bool:
+        """Return True if friction depends on loads, and the rows come near to losing rank along the run."""
+        if not any("coefficient" in force for force in self.table["force"]):
+            return False
+        run = self.run(ts=np.linspace(0.0, float(self.middle.time), ALONG))
+        sigma = np.array([self._singular_values(q) for q in np.asarray(run.q) if np.isfinite(q).all()])
+        rank = int(np.sum(sigma[0] > LEAST_RANK * sigma[0, 0])) if sigma.size else 0
+        return rank > 0 and bool(np.min(sigma[:, rank - 1] / sigma[:, 0]) < SINGULAR)
+
+    def _singular_values(self, q: np.ndarray) -> np.ndarray:
+        terms = evaluate(self.table, 0.0, q, 0 * q)
+        rows = terms.psi_q / np.sqrt(terms.mass)
+        return np.linalg.svd(rows, compute_uv=False) if len(rows) else np.zeros(0)
 
     def check_runs(self, name: str, found: Any, right: Any, detail: str = "") -> None:
         """Compare two runs: their states, by the scene's own growth of errors, and how they ended."""
@@ -147,8 +169,11 @@ def happened(run: Any) -> list[tuple[str, float]]:
 
 
 def difference_of_events(one: Any, two: Any) -> float:
-    """Return the largest difference of the times of events, infinite where other events happened."""
-    a, b = (sorted(happened(run)) for run in (one, two))
+    """Return the largest difference of the times of events, infinite where other events happened.
+
+    Of joints that come to rest at one instant, as all of a linkage with one degree of freedom do, the first in the list is any.
+    """
+    a, b = (sorted((ANY_JOINT.sub("", name), t) for name, t in happened(run)) for run in (one, two))
     if [name for name, _ in a] != [name for name, _ in b]:
         return np.inf
     return max((abs(x - y) for (_, x), (_, y) in zip(a, b, strict=True)), default=0.0)

@@ -35,7 +35,7 @@ ALONE: dict[str, Callable[[Case], None]] = {
 }
 OF_ALL = "tolerances", "states", "energy"  # checks of each member; the others take the first of its structure alone
 RARE = {"engines": 4}  # checks of every n-th structure alone: other engines compile for a minute
-LIMIT = 400.0  # s of processor time for one check; those of other engines compile four programs of up to 90 s
+LIMIT = 600.0  # s of processor time for one check; those of other engines compile four programs of up to 130 s
 
 
 class _TooLong(BaseException):

@@ -236,9 +236,20 @@ def _with_events(run: _Run, events: Any, max_events: int | None) -> Solution:
     solution, end = simulate_events(run.system, events, *given, most, run.all_concrete)
     if not run.is_concrete or not _has_failed(solution.code):
         return solution
-    if events is not None and (not run.mechanism.has_bodies or int(solution.stats.get("events", 0))):
-        return solution  # events may have changed what moved; joints that stick or slip have not
+    if events is not None and (not run.mechanism.has_bodies or _may_move_otherwise(solution)):
+        return solution
     return run.explained(solution, end) if events is not None or run.sticks else solution
+
+
+def _may_move_otherwise(solution: Solution) -> bool:
+    """Return whether events may have left other constraints at the end of a run than the scene has, those of sticking excepted."""
+    changes, found = solution.scene_changes, solution.events
+    if changes is None or found is None or not int(found.count):
+        return False
+    last = int(np.isfinite(np.asarray(solution.q)).all((1, 2)).sum()) - 1
+    of_scene = np.arange(changes.holds.shape[1]) < changes.of_scene
+    is_late = np.asarray(found.time) > solution.ts[max(last, 0)]
+    return last < 0 or bool(is_late.any() or (np.asarray(changes.holds)[last] != of_scene).any())
 
 
 def _without_events(run: _Run, throw: bool, located: Solution | None = None) -> Solution:

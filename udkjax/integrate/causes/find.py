@@ -193,7 +193,8 @@ def _explain_small_step(run: FailedRun) -> str | None:
 
 
 def _explain_many_steps(run: FailedRun) -> str | None:
-    text = _reach_at_end(run) or explain_violent_force(run) or explain_stiff_force(run) or _near_singular(run)
+    text = explain_jamming(run) or _reach_at_end(run) or explain_violent_force(run) or explain_stiff_force(run)
+    text = text or _near_singular(run)
     if text:
         return f"the limit of {run.steps} steps was reached: {text}"
     done = (run.time - run.ts[0]) / (run.ts[-1] - run.ts[0])

@@ -326,3 +326,22 @@ def test_a_lock_that_would_have_to_stop_a_driver_is_impossible_whichever_row_is_
         event = udk.Event(lambda t, at: t - 0.1, udk.Lock(pin), direction=1, name="lock")
         sol = udk.simulate(mech, [0.0, 0.2], udk.assemble(mech), events=[event], engine=engine, throw=False)
         assert (sol.result, round(float(sol.time), 9)) == (udk.Result.event_impossible, 0.1), pin
+
+
+@pytest.mark.parametrize("slant", [0.1, 1e-2, 1e-3])
+@pytest.mark.parametrize("engine", ["native", pytest.param("diffrax", marks=pytest.mark.slow)])
+def test_a_joint_that_stops_its_own_condition_is_attached_once(slant, engine):
+    """A rod between parallel cranks stops them, with a singular value that is as small as the rod is nearly parallel to them.
+
+    The condition stays at zero, and rounding, which this value amplifies, must not count as its passing zero again.
+    """
+    mechanism = udk.library.parallelogram()
+    rod = udk.Distance(("link1", "link2"), [[0.3, 0.2], [0.3 + slant, 0.2]])
+    for time in (0.3, 1.2):
+        angle = float(udk.simulate(mechanism, [0.0, time]).q[-1, 0, 2])
+        event = udk.Event(lambda t, at, angle=angle: at["link1"].angle - angle, udk.Attach(rod, "rod"), name="attach")
+        for tol in (1e-6, 1e-8, 1e-11):
+            found = udk.simulate(mechanism, [0.0, 2.0], rtol=tol, atol=tol, events=[event], engine=engine)
+            assert found.events.count == 1
+            np.testing.assert_allclose(found.events.v_after[0], 0.0, atol=1e-14)
+            np.testing.assert_allclose(found.q[-1], found.events.q_after[0], atol=1e-11)

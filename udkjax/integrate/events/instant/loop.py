@@ -13,10 +13,18 @@ from jaxtyping import Bool, Int
 from udkjax.integrate.events.instant.hops import ends_hop, return_to_top
 from udkjax.integrate.events.instant.impacts import CLOSED, OPEN
 from udkjax.integrate.events.instant.jumps import apply_event
-from udkjax.integrate.events.instant.runs import AGAIN, BEGIN, RECORD, MemberIndices, MemberRuns, take
+from udkjax.integrate.events.instant.runs import AGAIN, BEGIN, RECORD, MemberIndices, MemberRuns, RunState, take
 from udkjax.integrate.events.instant.sticking import begin_with_friction
 from udkjax.integrate.events.instant.system import StateValues, System, condition_values
-from udkjax.integrate.events.law.crossings import NO_EVENT, ZERO, ConditionValues, crosses, first_crossing, side_of_zero
+from udkjax.integrate.events.law.crossings import (
+    NO_EVENT,
+    ZERO,
+    ZERO_RATE,
+    ConditionValues,
+    crosses,
+    first_crossing,
+    side_of_zero,
+)
 from udkjax.integrate.events.law.kinks import FREE, MOST_KINKS
 from udkjax.integrate.solution import Result
 from udkjax.native.watching.conditions import RESOLUTION
@@ -125,6 +133,8 @@ def _jump(
     is_current = np.arange(2 * E) == e[:, None]
     falls = xp.asarray(plan.impacts | plan.kinks | plan.slides)[e] | releases
     sides = xp.where(is_current, xp.where(falls[:, None], 1, -sides), sides)
+    if plan.adds.any():
+        sides = xp.where(is_current & _stands(system, members, e, after, values, state_values)[:, None], 0, sides)
     noted, others, closed = k[:, None], xp.zeros((len(k), 0), bool), xp.full(held.shape, OPEN)
     if contacts is not None:
         closed = contacts.closed
@@ -187,6 +197,17 @@ def _jump(
         code=code,
         running=(code == Result.successful) & (follows | (before.t < take(system.end, members))),
     )._replace(joints=after.joints)
+
+
+def _stands(
+    system: System, members: MemberIndices, e: Int[Any, "b"], after: RunState, values: ConditionValues, found: StateValues
+) -> Bool[Any, "b"]:
+    """Return whether a joint that event e adds stops its condition, which stays where it happened: on neither side of zero."""
+    xp, own = system.xp, np.arange(system.plan.count) == e[:, None]
+    rate = found.by_t + xp.sum(found.by_q * after.v[:, None], axis=-1)
+    slow = xp.abs(rate) <= ZERO_RATE * values.scale * take(system.rate, members)[:, None]
+    counts = system.plan.adds & ~system.plan.follows_velocity
+    return xp.any(own & slow & counts, axis=-1)
 
 
 def _carried(system: System, members: MemberIndices, carried: Bool[Any, "b E"], joints: Any) -> Bool[Any, "b E"]:
