@@ -242,7 +242,7 @@ def _with_events(run: _Run, events: Any, max_events: int | None) -> Solution:
 
 
 def _may_move_otherwise(solution: Solution) -> bool:
-    """Return whether events may have left other constraints at the end of a run than the scene has, those of sticking excepted."""
+    """Return whether events may have left other constraints at the end of a run than the scene has, except by sticking."""
     changes, found = solution.scene_changes, solution.events
     if changes is None or found is None or not int(found.count):
         return False

@@ -101,7 +101,7 @@ def _apply_event(
         # The new velocities satisfy the phase without its contacts at rest, since these contacts may open.
         q1, _, _ = system.project(members, RunState(t, q, v, after, joints))
         _, v1, _ = system.project(members, RunState(t, q1, v, plan.free(after), joints), is_free=True)
-        # A nearly dependent row amplifies rounding: after one projection, a mechanism that stops would still creep past its event.
+        # A nearly dependent row amplifies rounding: after one projection, what stops would still creep past its event.
         _, v1, left = system.project(members, RunState(t, q1, v1, plan.free(after), joints), is_free=True)
         # A driver may demand velocities that the new joints do not allow: v1 is then a compromise, or violates either row.
         unit = take(system.coordinates, members)
