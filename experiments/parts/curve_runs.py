@@ -15,7 +15,6 @@ from udkjax.synthesis.curves.curve_designs import CurveDesign
 from udkjax.synthesis.curves.curve_search import CurveSearch
 from udkjax.synthesis.curves.descent import Task, evaluate
 from udkjax.synthesis.curves.dyads import Topology
-from udkjax.synthesis.curves.linkage_drawing import TurnStates
 from udkjax.synthesis.curves.matching import find_starts
 from udkjax.synthesis.curves.mechanisms_for import SIZE, TRANSMISSION, curve_limits
 from udkjax.synthesis.curves.targets import WantedCurve
@@ -25,7 +24,6 @@ MOST_RESULTS = 12  # designs of a search: with each number of bars
 PATH, SEGMENTS = 240, 60  # numbers in the data of a curve
 LONG = 600.0  # CPU time that no search takes (s)
 TIMES = 40  # progress reports of a search
-NEWTON_STEPS = 3  # from a quadratic guess at steps of half a degree
 SAME = 1e-9  # largest distance of pins before and after a turn, relative to the size
 STARTS, STEPS = 300, 100  # of BFGS: random linkages, and steps with each of two blurs
 Result = dict[str, Any]
@@ -45,8 +43,8 @@ def stored(folder: Path | None, name: str, compute: Callable[[], Result]) -> Res
     return result
 
 
-def search(curve: np.ndarray, rounds: int, seed: int = 0) -> Result:
-    """Return what `udk.mechanisms_for` finds by default within some rounds, and checks of the best design."""
+def search(curve: np.ndarray, rounds: int, seed: int = 0, **options: Any) -> Result:
+    """Return what `udk.mechanisms_for` finds within some rounds, by default or with options, and checks of the best design."""
     reports: list[tuple[float, float]] = []
     begun = time.process_time()
 
@@ -55,43 +53,39 @@ def search(curve: np.ndarray, rounds: int, seed: int = 0) -> Result:
         if said:
             reports.append((time.process_time() - begun, float(error)))
 
-    found = udk.mechanisms_for(curve, seconds=LONG, rounds=rounds, seed=seed, results=MOST_RESULTS, progress=note)
+    given: dict[str, Any] = {"seconds": LONG, "rounds": rounds, "seed": seed, "results": MOST_RESULTS, "progress": note, **options}
+    found = udk.mechanisms_for(curve, **given)
     spent, best = time.process_time() - begun, min(found, key=lambda one: one.error)
     errors = [min((one.error for one in found if one.bars <= bars), default=np.inf) for bars in BARS]
     reports = [*reports[-TIMES + 1 :], (spent, best.error)]
     path = best.curve[np.linspace(0, len(best.curve) - 1, PATH).astype(int)]
-    given = {"error": errors, "bars": best.bars, "seconds": spent, "rounds": found.rounds, "reports": reports}
-    return given | check(best, curve) | {"path": path.tolist(), "links": _links(best)}
+    outcome = {"error": errors, "bars": best.bars, "seconds": spent, "rounds": found.rounds, "reports": reports}
+    return outcome | check(best, curve) | {"path": path.tolist(), "links": _links(best)}
 
 
 def check(design: CurveDesign, curve: np.ndarray) -> Result:
-    """Follow a mechanism over a turn by Newton's method on its own equations; return what must hold.
+    """Follow a mechanism over 720 positions of a turn by `udk.kinematics`; return what must hold, and the CPU time of it.
 
-    `turned`: Newton's method converges at each of 720 positions from the two before, and the motor turns once. `open`: the
-    largest gap of a loop, relative to coordinates. `size`: relative to the limit. `off`: largest distance of the pin from the
-    returned curve while it draws, in extents of the wanted curve: another branch would draw another one.
+    `turned`: all positions are reached, and the last one is the first. `open`: the largest gap of a loop, relative to coordinates.
+    `size`: relative to the limit. `off`: largest distance of the pin from the returned curve while it draws, in extents of the
+    wanted curve: another branch would draw another one.
     """
-    wanted, mechanism = WantedCurve(curve), design.mechanism
-    q = [np.asarray(mechanism.q0).ravel()] * 2
-    ts = np.arange(721) / 720  # at 60 rpm
-    gap = np.zeros(len(ts))
-    for k, t in enumerate(ts):
-        new = 2.0 * q[-1] - q[-2]
-        for _ in range(NEWTON_STEPS):
-            new = new - np.linalg.lstsq(udk.equations.psi_q(mechanism, t, new), udk.equations.psi(mechanism, t, new))[0]
-        q.append(new)
-        gap[k] = np.abs(udk.equations.psi(mechanism, t, new)[:-1]).max()
-    states = TurnStates(ts, np.reshape(q[2:], (len(ts), -1, 3)), np.zeros((len(ts), len(q[0]) // 3, 3)))
-    pins = np.stack([np.asarray(udk.path(mechanism, states, pin)) for pin in design.pins])
+    wanted, mechanism, ts = WantedCurve(curve), design.mechanism, np.arange(721) / 720  # at 60 rpm
+    begun = time.process_time()
+    motion = udk.kinematics(mechanism, None, ts)
+    spent = time.process_time() - begun
+    gap = np.abs(udk.violation(mechanism, motion)).max()
+    pins = {pin: np.asarray(udk.path(mechanism, motion, pin)) for pin in design.pins}
     middle = np.array([wanted.middle.real, wanted.middle.imag])
-    size = float(np.linalg.norm(pins - middle, axis=-1).max())
-    drawn = pins[list(design.pins).index(design.pin)][2 * np.pi * ts <= np.ptp(design.values)]
-    back = np.abs(pins[:, -1] - pins[:, 0]).max() / size  # the turn ends where it began
+    size = max(float(np.linalg.norm(path - middle, axis=1).max()) for path in pins.values())
+    back = max(float(np.abs(path[-1] - path[0]).max()) for path in pins.values())
+    drawn = pins[design.pin][2 * np.pi * ts <= np.ptp(design.values)]
     return {
-        "turned": bool(back < SAME),
-        "open": float(gap.max() / (size + np.linalg.norm(middle))),
+        "turned": bool(np.all(motion.reached) and back < SAME * size),
+        "open": float(gap / (size + np.linalg.norm(middle))),
         "size": size / (SIZE * wanted.extent),
         "off": float(cKDTree(design.curve).query(drawn)[0].max() / wanted.extent),
+        "following": spent,
     }
 
 

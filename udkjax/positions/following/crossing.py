@@ -15,10 +15,13 @@ from jaxtyping import Array, Bool, Float
 
 from udkjax.positions.following.curve import AbstractCurve
 
-# Bounds on singular values sigma of E, relative to the largest. Rounding errors are 1e-16 / sigma in q, 1e-16 / sigma^2 in q' and
-# 1e-16 / sigma^3 in q''. Below NEAR_LOSS, fewer than ten digits of q'' are correct, and q'' is interpolated; below
-# LOST_RANK no digit is correct.
+# Bounds on singular values sigma of E, relative to the largest. Near a meeting of branches sigma grows by about one per unit of
+# the arc, and rounding errors are 1e-16 / sigma in q, 1e-16 / sigma^2 in q' and 1e-16 / sigma^3 in q''. Below NEAR_LOSS, fewer
+# than ten digits of q'' are correct, and q'' is interpolated; below LOST_RANK no digit is correct.
 NEAR_LOSS, LOST_RANK = 1e-2, 1e-5
+# If sigma grows by c per unit, the error of q'' is 1e-16 (1 / sigma^2 + c^2 / sigma^3): ten digits are correct from SMALL on, where
+# c is small, as where links are short beside the mechanism. Over RATE_ARC along the tangent, c is a difference.
+SMALL, RATE_ARC = NEAR_LOSS**1.5, 1e-3
 # Largest scaled distance from a meeting at which a step along the tangent still crosses it; the tangent turns by about a degree.
 CLOSE_DISTANCE = 0.02
 # Values of h, scaled. Errors of the polynomials are 3e-10, 3e-15 and less with these, if the next singularity of q(s) is one unit
@@ -62,6 +65,14 @@ class Crossing(NamedTuple):
     spacing: Float[Array, ""]  # the step h
 
 
+def _is_accurate(curve: AbstractCurve, X: Array, tau: Array) -> Bool[Array, ""]:
+    """Return whether ten digits of q'' are correct without interpolation."""
+    by, xp = curve.by, curve.by.xp
+    clearance = by.map(curve.clearance, X + RATE_ARC * xp.array([0.0, -1.0, 1.0])[:, None] * tau)
+    rate = xp.max(xp.abs(clearance - clearance[0])) / RATE_ARC
+    return (clearance[0] > SMALL) & (rate**2 * NEAR_LOSS**3 < clearance[0] ** 3)
+
+
 def find_crossing(curve: AbstractCurve, X: Float[Array, "n+1"], tau: Float[Array, "n+1"]) -> tuple[Crossing, Bool[Array, ""]]:
     """Return a point with q', q'' and q''', interpolated from both sides.
 
@@ -71,19 +82,23 @@ def find_crossing(curve: AbstractCurve, X: Float[Array, "n+1"], tau: Float[Array
         tau: the approximate direction of the branch.
 
     Returns:
-        The crossing, and whether it is accepted.
+        The crossing, and whether it is accepted; it is not if it is not needed.
     """
 
     def tried(h: Float[Array, ""]) -> tuple[Array, Array, Array, Array, Array]:
         return _interpolate(curve, X, tau, h)
 
+    def interpolated() -> tuple[Crossing, Bool[Array, ""]]:
+        *values, doubt = by.map(tried, spacings)
+        at, dq, ddq, dddq, h, doubt = (x[xp.argmin(doubt)] for x in (*values, spacings, doubt))
+        slope = xp.append(dq * curve.units[-1] / curve.units[:-1], 1.0)
+        slope = slope / xp.linalg.norm(slope) * xp.where(slope @ tau < 0, -1.0, 1.0)
+        return Crossing(at, slope, dq, ddq, dddq, h), doubt < 1.0
+
     by, xp = curve.by, curve.by.xp
-    spacings = xp.asarray(SPACINGS, X.dtype)
-    *values, doubt = by.map(tried, spacings)
-    at, dq, ddq, dddq, h, doubt = (x[xp.argmin(doubt)] for x in (*values, spacings, doubt))
-    slope = xp.append(dq * curve.units[-1] / curve.units[:-1], 1.0)
-    slope = slope / xp.linalg.norm(slope) * xp.where(slope @ tau < 0, -1.0, 1.0)
-    return Crossing(at, slope, dq, ddq, dddq, h), doubt < 1.0
+    spacings, unknown = xp.asarray(SPACINGS, X.dtype), xp.zeros_like(X[:-1])
+    none = Crossing(X, tau, unknown, unknown, unknown, spacings[0]), xp.asarray(False)
+    return by.cond(_is_accurate(curve, X, tau), lambda: none, interpolated)
 
 
 def find_toggle(curve: AbstractCurve, X: Float[Array, "n+1"], tau: Float[Array, "n+1"]) -> tuple[Array, Bool[Array, ""]]:

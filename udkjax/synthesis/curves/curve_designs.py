@@ -12,7 +12,7 @@ from udkjax.scene.mechanism import Mechanism
 from udkjax.synthesis.curves.curve_search import FoundLinkage, drawn
 from udkjax.synthesis.curves.dyads import SPAN
 from udkjax.synthesis.curves.found_mechanism import FoundMechanism
-from udkjax.synthesis.curves.linkage_drawing import PIN, drawing_of, is_closed_over_turn, states_of_turn
+from udkjax.synthesis.curves.linkage_drawing import PIN, drawing_of, turns_on_its_branch
 from udkjax.synthesis.curves.targets import WantedCurve, as_points
 
 
@@ -29,7 +29,7 @@ class CurveDesign(FoundMechanism):
         size: largest distance (m) of any pin from the middle of the curve over the whole turn.
         transmission: smallest angle (rad) between the two links of a dyad, or between one and the other prolonged.
         values: values of the driver (rad) at the ends of the curve.
-        turns: True: at 720 positions of a whole turn all constraints hold and no dyad nears its dead points.
+        turns: True: `kinematics` follows the mechanism over 720 positions of a whole turn, on one branch.
         driver: the driver.
     """
 
@@ -95,11 +95,10 @@ class CurveDesigns(PrintsTable):
 
 
 def confirmed(found: FoundLinkage, wanted: WantedCurve, name: str, unit: str) -> CurveDesign | None:
-    """Return a linkage as a design; None if a constraint of its mechanism does not hold at 720 positions of a turn."""
+    """Return a linkage as a design; None if `kinematics` does not follow its mechanism over the whole turn on its branch."""
     mechanism = drawing_of(found.x, found.topology, wanted, name, unit).mechanism()
     size = wanted.scale * found.size
-    states = states_of_turn(mechanism, found.x, found.topology, wanted)
-    if not is_closed_over_turn(mechanism, states, size + abs(wanted.middle)):
+    if not turns_on_its_branch(mechanism, found.x, found.topology, wanted, size + abs(wanted.middle)):
         return None
     driver = only_driver(mechanism)
     start = float(drive(mechanism, driver).value(mechanism.q0))

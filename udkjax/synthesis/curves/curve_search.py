@@ -142,6 +142,12 @@ class CurveSearch:
         """The smallest Chamfer distance so far; infinite before the first linkage is finished."""
         return min((one.error for found in self.found.values() for one in found), default=np.inf)
 
+    def promises(self, error: float) -> bool:
+        """Return True if an unfinished linkage may have such an error when finished: it has no more than twice as much."""
+        blur = OF_GROWTH[-1][0]
+        losses = [loss for kept in self.fresh.values() for loss in kept.loss if loss not in self.finished]
+        return min(losses, default=np.inf) <= 2.0 * (np.hypot(error, blur) - blur)
+
     def finish(self, until: float = np.inf) -> None:
         """Finish the best linkages, the most promising first, also of an incomplete round; after a time only until there is one.
 

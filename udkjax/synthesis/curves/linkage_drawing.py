@@ -1,12 +1,13 @@
-"""A linkage of dyads as a drawing, and the check of its whole turn by the equations of the mechanism."""
+"""A linkage of dyads as a drawing, and the check of its whole turn by the kinematics of the mechanism."""
 
 from string import ascii_uppercase
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from udkjax.equations.states.quantities import violation
-from udkjax.positions.following.kinematics import FULL_TURN
+from udkjax.positions.assembling.channels import locate
+from udkjax.positions.following.kinematics import FULL_TURN, kinematics
 from udkjax.scene.drawing import Drawing
 from udkjax.scene.drawing.drawn_quantities import Units
 from udkjax.scene.mechanism import Mechanism
@@ -14,8 +15,9 @@ from udkjax.synthesis.curves.dyads import BASE, EACH, GEARED, HEAD, SECOND, TAIL
 from udkjax.synthesis.curves.targets import WantedCurve
 
 PIN = "P"  # name of the drawing pin
-TURN_VALUES = 720  # positions of a turn at which the constraints must hold
+TURN_VALUES = 720  # positions of a turn at which the constraints must hold, on one branch
 CLOSED_TO = 1e-12  # largest residual of a constraint at these positions, relative to coordinates of its pins, or to a turn
+SAME_PLACE = 1e-8  # largest distance of a pin from itself by another method, relative to these; on other branches it is elsewhere
 DENSITY = 7850.0  # kg/m^3, of steel
 WIDTH, THICKNESS = 0.03, 0.01  # of links, relative to the extent of the curve
 WHEELS = 0.6  # sum of the radii of two wheels, relative to the distance of their centres
@@ -88,31 +90,23 @@ def _link(pins: list[str], places: dict[str, complex], extent: float, size: floa
     return named | {"mass": mass, "centre": (middle.real, middle.imag), "inertia": f"{mass * length**2 / 12!r} kg m2"}
 
 
-class TurnStates(NamedTuple):
-    """Positions of a mechanism over a turn at constant speed: times (T,) (s), q and v (T, bodies, 3)."""
+def turns_on_its_branch(mechanism: Mechanism, x: np.ndarray, topology: Topology, wanted: WantedCurve, size: float) -> bool:
+    """Return whether `kinematics` follows a mechanism over a turn, all constraints closed, on the branch of the linkage.
 
-    ts: np.ndarray
-    q: np.ndarray
-    v: np.ndarray
-
-
-def states_of_turn(mechanism: Mechanism, x: np.ndarray, topology: Topology, wanted: WantedCurve) -> TurnStates:
-    """Return 721 positions of a mechanism over a turn, moved from its drawn position as the closed form of the linkage moves."""
-    theta = np.linspace(0.0, FULL_TURN, TURN_VALUES + 1)
-    at = positions(x[None], topology, theta[None], 0.0)
-    numbers = {_link_name(k): k for k in range(1, len(at.turns))}
-    q0 = np.asarray(mechanism.q0).reshape(-1, 3)
-    q = np.empty((len(theta), len(q0), 3))
-    for k, body in enumerate(mechanism.bodies):
-        z, turn = at.origins[numbers[body], 0], at.turns[numbers[body], 0]
-        turn, places = turn / turn[0], wanted.middle + wanted.scale * z
-        moved = places + turn * (complex(*q0[k, :2]) - places[0])
-        q[:, k] = np.stack([moved.real, moved.imag, q0[k, 2] + np.unwrap(np.angle(turn))], 1)
-    return TurnStates(theta / (FULL_TURN * TURNS_PER_SECOND), q, np.zeros_like(q))
-
-
-def is_closed_over_turn(mechanism: Mechanism, states: TurnStates, size: float) -> bool:
-    """Return whether the mechanism's own constraints, with those of its motor, hold at all positions of a turn."""
-    open_by = np.abs(violation(mechanism, states))
+    Args:
+        mechanism: the mechanism of a drawing of the linkage.
+        x: the numbers of the linkage.
+        topology: its structure.
+        wanted: the curve.
+        size: coordinates of pins (m) are no larger.
+    """
+    turns = np.linspace(0.0, 1.0, TURN_VALUES + 1)
+    motion = kinematics(mechanism, None, turns / TURNS_PER_SECOND)
+    if not np.all(motion.reached):
+        return False
+    open_by = np.abs(violation(mechanism, motion))
     of_motor = len(mechanism.drivers)  # the last rows, in rad
-    return bool(open_by[:, :-of_motor].max() <= CLOSED_TO * size and open_by[:, -of_motor:].max() <= CLOSED_TO * FULL_TURN)
+    pin = wanted.middle + wanted.scale * positions(x[None], topology, FULL_TURN * turns[None], 0.0).pin[0]
+    off = np.abs(np.asarray(motion.path(*locate(mechanism, f"pin.{PIN}", None))) @ [1, 1j] - pin)
+    is_closed = open_by[:, :-of_motor].max() <= CLOSED_TO * size and open_by[:, -of_motor:].max() <= CLOSED_TO * FULL_TURN
+    return bool(is_closed and off.max() <= SAME_PLACE * size)

@@ -36,6 +36,7 @@ def mechanisms_for(
     part: str = "free",
     transmission: Annotated[float, NOT_NEGATIVE] = TRANSMISSION,
     rounds: Annotated[int, COUNT] | None = None,
+    error: Annotated[float, NOT_NEGATIVE] | None = None,
     geared: bool = True,
     unit: str = "m",
     progress: ProgressOption = None,
@@ -54,21 +55,22 @@ def mechanisms_for(
             of the curve.
         results: largest number of designs to return.
         seconds: CPU time of this process, of all its threads, after which the search ends with the best designs so far (s), so
-            that other programs on the same machine do not shorten it. It runs until there is a design in any case, some seconds,
-            and ends earlier when the drawn curve is as near as samples of the same curve are to each other.
+            that other programs on the same machine do not shorten it. It runs until there is a design in any case, some seconds.
         seed: seed of the random linkages. The result follows from the seed and the number of completed stages, which depends on
             the processor's speed; give `rounds`, and enough seconds, for a result that does not.
         part: "free": an open curve is drawn by any part of the turn; "whole": by the whole turn, forth and back.
         transmission: smallest angle (rad) between the two links of a dyad, and between one and the other prolonged, over the
             whole turn.
         rounds: number of rounds after which the search ends.
+        error: error, relative to the RMS radius of the curve, with which a design is good enough: the search ends with the first
+            one. By default it ends after a round, when the drawn curve is as near as samples of the same curve are to each other.
         geared: whether a second crank, joined to the first by a belt, is allowed.
         unit: unit of lengths of the drawings, such as "mm"; it does not change the mechanisms.
         progress: as for `sweep`: None shows progress after two seconds, False never; or a function of a `Progress`. Ctrl-C ends
             the search with the best designs so far.
 
     Returns:
-        `CurveDesigns`, ranked by error and simplicity. Every design turns fully, confirmed by `kinematics`.
+        `CurveDesigns`, ranked by error and simplicity. Every design turns fully, confirmed by `kinematics` at 720 positions.
 
     Raises:
         ValueError: the curve or a limit is invalid, or the limits contradict each other.
@@ -80,27 +82,29 @@ def mechanisms_for(
     wanted = WantedCurve(curve, part == "whole")
     search = CurveSearch(wanted, curve_limits(wanted, size, float(transmission)), int(bars), int(seed), geared)
     begun = time.process_time()
-    done = _run(search, float(seconds), rounds, begun, progress)
+    done = _run(search, float(seconds), rounds, error, begun, progress)
     found = ranked(search.found, wanted, int(results), WORTH, unit)
     reason = "" if found else "no linkage turned within the limits: give more seconds, a larger size or a smaller transmission"
     return CurveDesigns(tuple(found), done, search.candidates, time.process_time() - begun, reason)
 
 
-def _run(search: CurveSearch, seconds: float, rounds: int | None, begun: float, progress: ProgressOption) -> int:
+def _run(
+    search: CurveSearch, seconds: float, rounds: int | None, error: float | None, begun: float, progress: ProgressOption
+) -> int:
     """Run stages until the time is over; return the number of completed rounds."""
-    done, enough = 0, ENOUGH + 0.5 * search.wanted.length / CHAMFER_POINTS
+    done, enough = 0, ENOUGH + 0.5 * search.wanted.length / CHAMFER_POINTS if error is None else error
     try:
         with report_progress(progress, seconds or None, "mechanisms_for") as report:
             for stage in search.stages():
-                if not search.found:  # from now on there is something to return
-                    search.finish()
+                if not search.found or (error is not None and search.promises(error)):
+                    search.finish()  # from now on there is something to return
                 search.until = begun + GROWING * seconds if search.found or done else np.inf
-                error = f", error {search.best:.4g}" if np.isfinite(search.best) else ""
-                report(min(time.process_time() - begun, seconds), stage + error)
-                if stage.endswith("finished"):
-                    done += 1
-                    if search.best <= enough or done == rounds:
-                        return done
+                best = f", error {search.best:.4g}" if np.isfinite(search.best) else ""
+                report(min(time.process_time() - begun, seconds), stage + best)
+                is_round = stage.endswith("finished")
+                done += is_round
+                if done == rounds or (search.best <= enough and (is_round or error is not None)):
+                    return done
                 if time.process_time() > search.until:
                     break
     except (KeyboardInterrupt, OutOfTimeError):
