@@ -155,7 +155,7 @@ def test_a_curve_is_drawn_by_mechanisms_shown_and_written(tmp_path, capsys):
         (("--curve", "curve.csv", "--bars", 3), "bars must be at least 4"),
         (("--curve", "curve.csv", "--size", 1), "size must be more than"),
         (("--curve", "point.csv"), "coincide"),
-        (("--curve", "wrong.svg"), "no SVG file"),
+        (("--curve", "wrong.svg"), "not an SVG file"),
     ],
 )
 def test_curves_and_options_with_mistakes(tmp_path, monkeypatch, capsys, arguments, message):

@@ -7,12 +7,12 @@ which the pin may retrace a stroke. The star takes a second crank, driven by a b
 import numpy as np
 
 import udkjax as udk
-from udkjax.synthesis.curves.curve_file import points_of_path
 
+BOWL = np.exp(1j * np.linspace(0.0, np.pi, 49))
 LETTERS = {
-    "U": "M0 0 V4 A2 2 0 0 0 4 4 V0",
-    "D": "M0 6 V0 H1 A3 3 0 0 1 1 6 Z",
-    "K": "M0 0 V6 V3.6 L4 0 L1.5 2.25 L4 6",
+    "U": np.array([0, *(2 - 4j - 2 * BOWL), 4]),
+    "D": np.array([-6j, 0, *(1 - 3j + 3j / BOWL), -6j]),
+    "K": np.array([0, -6j, -3.6j, 4, 1.5 - 2.25j, 4 - 6j]),
 }
 SIZE = 8.0  # m, from the middle of a curve that is 6 m high
 TURN = 1.0  # s, at 60 rpm
@@ -24,9 +24,7 @@ def make():
     """Return the errors, and the player of all mechanisms side by side."""
     corners = np.arange(11)
     star = np.where(corners % 2, 1.8, 4.0) * np.exp(1j * np.pi * (0.5 + corners / 5))
-    curves = {name: points_of_path(path) for name, path in LETTERS.items()} | {
-        "star": np.stack([np.real(star), np.imag(star)], 1)
-    }
+    curves = {name: np.stack([np.real(z), np.imag(z)], 1) for name, z in (LETTERS | {"star": star}).items()}
     facts, mechanisms, motions = {}, {}, {}
     for name, curve in curves.items():
         best = udk.mechanisms_for(curve, size=SIZE, seconds=600, rounds=1 + (name in ("K", "star")), results=1, progress=False)[0]

@@ -53,7 +53,14 @@ def search(curve: np.ndarray, rounds: int, seed: int = 0, **options: Any) -> Res
         if said:
             reports.append((time.process_time() - begun, float(error)))
 
-    given: dict[str, Any] = {"seconds": LONG, "rounds": rounds, "seed": seed, "results": MOST_RESULTS, "progress": note, **options}
+    given: dict[str, Any] = {
+        "seconds": LONG,
+        "rounds": rounds,
+        "seed": seed,
+        "results": MOST_RESULTS,
+        "progress": note,
+        **options,
+    }
     found = udk.mechanisms_for(curve, **given)
     spent, best = time.process_time() - begun, min(found, key=lambda one: one.error)
     errors = [min((one.error for one in found if one.bars <= bars), default=np.inf) for bars in BARS]
@@ -66,7 +73,7 @@ def search(curve: np.ndarray, rounds: int, seed: int = 0, **options: Any) -> Res
 def check(design: CurveDesign, curve: np.ndarray) -> Result:
     """Follow a mechanism over 720 positions of a turn by `udk.kinematics`; return what must hold, and the CPU time of it.
 
-    `turned`: all positions are reached, and the last one is the first. `open`: the largest gap of a loop, relative to coordinates.
+    `turned`: all positions are reached, and the last one is the first. `open`: largest gap of a loop, relative to coordinates.
     `size`: relative to the limit. `off`: largest distance of the pin from the returned curve while it draws, in extents of the
     wanted curve: another branch would draw another one.
     """

@@ -1,8 +1,9 @@
 """Curves for linkages: capital letters, each in one stroke of a pen, classic curves, and curves of random linkages."""
 
 import numpy as np
+import svgelements
 
-from udkjax.synthesis.curves.curve_file import points_of_path
+from udkjax.synthesis.curves.curve_file import FRACTIONS
 from udkjax.synthesis.curves.dyads import BASE, EACH, HEAD, SECOND, Topology, number_count, positions
 
 LETTERS = {
@@ -33,6 +34,12 @@ LETTERS = {
     "Y": "M0 0 L2 3 L4 0 L2 3 V6",
     "Z": "M0 0 H4 L0 6 H4",
 }
+
+
+def points_of_path(path: str) -> np.ndarray:
+    """Return the points (n, 2) of a path of SVG in one stroke, with y upwards."""
+    segments = [one for one in svgelements.Path(path).segments() if not isinstance(one, svgelements.Move)]
+    return np.concatenate([one.npoint(FRACTIONS) for one in segments]) * [1.0, -1.0]
 
 
 def letter(name: str) -> np.ndarray:

@@ -50,7 +50,7 @@ def design(
         seed: seed of the random mechanisms; the same seed gives the same designs.
         results: maximum number of designs to return.
         out: folder for each design as a drawing (design1.toml) and as an animated page (design1.html).
-        curve: file with a curve instead of a goal: rows x, y (.csv), or a drawing with one path (.svg).
+        curve: file with a curve instead of a goal: rows x, y (.csv), or a drawing in one stroke (.svg).
         bars: largest number of links for a curve, with the ground.
         size: for a curve, the largest distance of any pin from its middle, in its unit; by default three times its extent.
         seconds: CPU time after which the search for a curve ends (s).

@@ -90,6 +90,7 @@ from udkjax.scene.numbers.units import read_quantity as read_quantity
 from udkjax.scene.outlines.outline import Outline as Outline
 from udkjax.scene.outlines.outline import RoundHole as RoundHole
 from udkjax.scene.outlines.outline import read_outline as read_outline
+from udkjax.scene.outlines.svg import read_svg as read_svg
 from udkjax.scene.reshaping import length_of as length_of
 from udkjax.scene.reshaping import with_angle as with_angle
 from udkjax.scene.reshaping import with_length as with_length

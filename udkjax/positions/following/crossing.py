@@ -19,8 +19,8 @@ from udkjax.positions.following.curve import AbstractCurve
 # the arc, and rounding errors are 1e-16 / sigma in q, 1e-16 / sigma^2 in q' and 1e-16 / sigma^3 in q''. Below NEAR_LOSS, fewer
 # than ten digits of q'' are correct, and q'' is interpolated; below LOST_RANK no digit is correct.
 NEAR_LOSS, LOST_RANK = 1e-2, 1e-5
-# If sigma grows by c per unit, the error of q'' is 1e-16 (1 / sigma^2 + c^2 / sigma^3): ten digits are correct from SMALL on, where
-# c is small, as where links are short beside the mechanism. Over RATE_ARC along the tangent, c is a difference.
+# If sigma grows by c per unit, the error of q'' is 1e-16 (1 / sigma^2 + c^2 / sigma^3): where c is small, as with links that are
+# short beside the mechanism, ten digits are correct from SMALL on. Over RATE_ARC along the tangent, c is a difference.
 SMALL, RATE_ARC = NEAR_LOSS**1.5, 1e-3
 # Largest scaled distance from a meeting at which a step along the tangent still crosses it; the tangent turns by about a degree.
 CLOSE_DISTANCE = 0.02
