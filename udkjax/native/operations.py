@@ -30,6 +30,7 @@ from udkjax.native.run.state_functions import (
     StateFunction,
     StateJump,
     StateProjection,
+    StateReactions,
     StateTangentPart,
 )
 from udkjax.native.watching.conditions import Conditions
@@ -143,6 +144,11 @@ class StateOperation(Operation):
         return ProjectStates(self.code, self.pseudoinverse, self.formulation)
 
     @property
+    def reactions(self) -> "FindReactions":
+        """The operation that computes multipliers, if the pseudoinverse is dense."""
+        return FindReactions(self.code, self.pseudoinverse, self.formulation)
+
+    @property
     def jump(self) -> "ProjectJump":
         """The operation that projects states after events."""
         return ProjectJump(self.code, self.pseudoinverse, self.formulation)
@@ -167,6 +173,15 @@ class Accelerate(StateOperation):
     """Compute the accelerations of states."""
 
     function = StateAccelerations
+
+
+class FindReactions(StateOperation):
+    """Compute the multipliers of all rows by a dense method, and the entries of Psi_q."""
+
+    function = StateReactions
+
+    def outputs(self, inputs: Sequence[Any], times: int) -> list[tuple[int, ...]]:
+        return [(self.code.row_count + self.code.scratch["psi_q"],)]
 
 
 class ProjectStates(StateOperation):

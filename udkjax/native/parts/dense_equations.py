@@ -35,7 +35,7 @@ class DenseEquations(ByRows):
         return ["dense_accelerations", *(of_projection if self._in.plan.projected else [])]
 
     def reserve(self):
-        self._rows = WeightedRows(self._in, self._method)
+        self.rows = WeightedRows(self._in, self._method)
         for name in ("state q", "state v"):
             self._in.places.add(f"saved {name}", self._in.n)
 
@@ -45,7 +45,7 @@ class DenseEquations(ByRows):
     def write(self):
         """Write the functions that the module calls instead of programs."""
         module = self._in
-        self._rows.write()
+        self.rows.write()
         for name, write in self._functions.items():
             if name in module.solving:
                 f, s = module.function(name, [(POINTER, "work"), (POINTER, "out")])
@@ -55,8 +55,8 @@ class DenseEquations(ByRows):
     def _factor(self, f: Function, of_positions: bool = False):
         """Factorize the rows, and note the largest rank of the attempted step: a stage or a projection may have a larger one."""
         s = Lane(f, self._in.places)
-        self._rows.factor(f, of_positions)
-        s.highest_rank = f.max(s.highest_rank, self._rows.matrices(f).row("rank").entry(0))
+        self.rows.factor(f, of_positions)
+        s.highest_rank = f.max(s.highest_rank, self.rows.matrices(f).row("rank").entry(0))
 
     @property
     def _functions(self) -> dict[str, Callable[[Function], None]]:
@@ -75,18 +75,18 @@ class DenseEquations(ByRows):
     def _accelerate(self, f: Function):
         self._in.invoke(f, "dense_accelerations")
         self._factor(f)
-        self._rows.correct(f, self._rows.solve(f, "terms", self._in.n), "terms", "out", 1.0)
+        self.rows.correct(f, self.rows.solve(f, "terms", self._in.n), "terms", "out", 1.0)
 
     def _correct_position(self, f: Function):
         self._in.invoke(f, "dense_newton_q")
         self._factor(f, of_positions=True)
-        self._rows.correct(f, self._rows.solve(f, "psi"), "state q", "corrected q")
+        self.rows.correct(f, self.rows.solve(f, "psi"), "state q", "corrected q")
 
     def _factor_and_correct_velocity(self, f: Function):
         def correct():
             self._in.invoke(f, "dense_newton_v")
             self._factor(f)
-            self._rows.correct(f, self._rows.solve(f, "psi"), "state v", "result v")
+            self.rows.correct(f, self.rows.solve(f, "psi"), "state v", "result v")
 
         correct()
         if not self._in.code.is_linear:  # a second step of Newton's method
@@ -109,12 +109,12 @@ class DenseEquations(ByRows):
         self._correct_position(f)
 
         def correct_velocity():
-            if self._rows.splits:
+            if self.rows.splits:
                 self._factor_and_correct_velocity(f)
                 module.invoke(f, "psi")
                 return
             module.invoke(f, "psi_dot")
-            self._rows.correct(f, self._rows.solve(f, "psi"), "state v", "result v")
+            self.rows.correct(f, self.rows.solve(f, "psi"), "state v", "result v")
             module.invoke(f, "psi")
 
         self._at(f, "state q", "corrected q", correct_velocity)
@@ -129,7 +129,7 @@ class DenseEquations(ByRows):
                 self._factor(f)
 
         self._at(f, "state v", "result v", terms)
-        self._rows.correct(f, self._rows.solve(f, "terms", module.n), "terms", "result a", 1.0)
+        self.rows.correct(f, self.rows.solve(f, "terms", module.n), "terms", "result a", 1.0)
 
     def _end_step(self, f: Function):
         self._project_and_accelerate(f)
@@ -142,7 +142,7 @@ class DenseEquations(ByRows):
 
     def _correct_changes(self, f: Function):
         """Compute the tangent parts of changes, with the factors of all rows; those of rows of Psi alone are computed for dq."""
-        module, rows = self._in, self._rows
+        module, rows = self._in, self.rows
         for x in ("dv", "dq") if rows.splits else ("dq", "dv"):
             change = f"state {x}"
             if x == "dq" and rows.splits:

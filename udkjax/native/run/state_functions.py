@@ -1,6 +1,7 @@
 """Machine code of functions of single states, for other integrators, in batches.
 
 StateAccelerations    accelerations of a state, by elimination or a dense method; by the fallback if pivots are too small
+StateReactions        multipliers of least norm, and the entries of Psi_q
 StateProjection       q and v projected onto the constraint manifold
 StateJump             the same after an event, and by how much the velocities still violate a row
 StateTangentPart      the tangent part of small changes of q and v
@@ -20,6 +21,7 @@ from udkjax.native.module.layout import Lane, Layout, Plan
 from udkjax.native.module.memory import Memory, ThreadCode
 from udkjax.native.module.steps import ROUNDING_PIVOT
 from udkjax.native.module.tableau import EULER
+from udkjax.native.parts.dense_equations import DenseEquations
 from udkjax.native.parts.formulations import FormulationCode
 from udkjax.native.parts.manifold import largest_violation, with_threshold
 from udkjax.native.pseudoinverses.dense import DenseMethod
@@ -101,6 +103,22 @@ class StateAccelerations(StateFunction):
 
     def _evaluate(self, f: Function, s: Lane):
         self.accelerations.accelerate_state(f, s)
+
+
+class StateReactions(StateAccelerations):
+    """The multipliers lambda = -W (D^+)^T D^+ W b of least norm, by a dense method, in `psi`, and the entries of Psi_q."""
+
+    @property
+    def counts(self) -> dict[str, int]:
+        return {"psi": self.m, "psi_q": self.code.scratch["psi_q"]}
+
+    def _evaluate(self, f: Function, s: Lane):
+        super()._evaluate(f, s)
+        assert isinstance(self.accelerations, DenseEquations)
+        rows = self.accelerations.rows
+        y = rows.solve_transposed(f)
+        with f.each(self.m) as i:
+            self.put_entry(f, "psi", i, -(y.entry(i) * rows.array(f, "weights", i)))
 
 
 class StateProjection(StateFunction):

@@ -113,8 +113,13 @@ def with_sides(events: Sequence[Event], sides: Float[Array, "S"], held: Sequence
 class FoundKinks(NamedTuple):
     """The kinks of forces, as far as they are known before a run."""
 
-    are_held: bool  # whether a force has kinks that can be located
+    held: tuple[str, ...]  # forces, or functions of a system, with kinks that can be located
     others: tuple[str, ...]  # forces, or functions of a system, with kinks that cannot
+
+    @property
+    def are_held(self) -> bool:
+        """True if a force has kinks that can be located."""
+        return bool(self.held)
 
     def remark(self, by_steps: str) -> str:
         """Return whether kinks are located, as text; empty without any. A run `by_steps` locates none."""
@@ -137,16 +142,17 @@ def _kinks_of_functions(functions: Any, breaks: bool) -> FoundKinks:
     smooth, moving = SmoothLoads.of_functions(functions, breaks), functions.moving(breaks)
     others = [] if not smooth.has_opaque else ["force"]
     others += [name for name, terms in functions.other_terms.items() if has_kinks(functions.graph, terms, moving)]
-    return FoundKinks(smooth.count > 0, tuple(others))
+    return FoundKinks(("force",) if smooth.count else (), tuple(others))
 
 
 def _kinks(mechanism: Mechanism) -> FoundKinks:
-    are_held, others = False, []
+    held, others = [], []
     for name, smooth, can_be_held in _smooth_forces(mechanism):
-        are_held |= can_be_held and smooth.count > 0
+        if can_be_held and smooth.count:
+            held.append(name)
         if smooth.has_opaque or (smooth.count and not can_be_held):
             others.append(name)
-    return FoundKinks(are_held, tuple(others))
+    return FoundKinks(tuple(held), tuple(others))
 
 
 _concrete_kinks = cached_by_identity(_kinks)

@@ -1,6 +1,6 @@
 """A folder of C99 that runs a scene: `export_c`."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
 
@@ -10,14 +10,16 @@ from udkjax.annotations import Numbers
 from udkjax.argument_types import NOT_NEGATIVE
 from udkjax.integrate.portable.c.scene import INFO, SceneCode, table
 from udkjax.integrate.solution import Result, versions
-from udkjax.native.c import CUnit
+from udkjax.native.c import CUnit, comment_text, string_text
 from udkjax.native.runs import RunStates
 from udkjax.requirements import ArgumentError
 from udkjax.scene.arguments import checked
 from udkjax.scene.elements.bodies import GROUND
 from udkjax.scene.mechanism import Mechanism
 
-What = Literal["run", "accelerations", "derivatives", "projection", "positions", "position_derivatives"]
+What = Literal[
+    "run", "step_derivatives", "accelerations", "derivatives", "projection", "positions", "position_derivatives", "reactions"
+]
 DOCUMENTED = {
     "run": """/* Integrate, and project each step onto the constraints: positions qs and velocities vs (times, {N})
    at the times ts, which increase (s), from the closed state q, v; the largest violation of the constraints at each
@@ -28,6 +30,10 @@ int {p}_run(const double *numbers, const double *ts, int times, const double *q,
 
 /* Lead a state over one interval dt (s) from the time t. Returns 0, or why the run ended: q and v then stay. */
 int {p}_step(const double *numbers, double t, double dt, double *q, double *v, double *memory);
+""",
+    "step_derivatives": """/* Lead a state over one interval, and its change dq, dv along changes dnumbers of the numbers. */
+int {p}_step_along(const double *numbers, double t, double dt, double *q, double *v, const double *dnumbers, double *dq,
+    double *dv, double *memory);
 """,
     "accelerations": """/* Accelerations a of a state by the Udwadia-Kalaba equation. */
 void {p}_accelerations(const double *numbers, double t, const double *q, const double *v, double *a, double *memory);
@@ -50,14 +56,19 @@ double {p}_close(const double *numbers, double t, double *q, double *v, double *
 void {p}_close_along(const double *numbers, double t, const double *q, const double *v, const double *dnumbers,
     const double *dq, const double *dv, double *dstate, double *memory);
 """,
+    "reactions": """/* Loads of joints and drivers, of least norm where redundant constraints share them: force x and y (N) and
+   torque (N m, about the centre of mass) of {loads}; and the efforts of drivers ({drivers}): torque (N m) or force (N)
+   along each coordinate. Of a motion that drivers prescribe, {p}_close finds the state. */
+void {p}_reactions(const double *numbers, double t, const double *q, const double *v, double *loads, double *efforts,
+    double *memory);
+""",
 }
 ALONG = """/* Write changes of the numbers. `parameters` has the parameters, and then their changes. */
 void {p}_set_parameters_along(const double *parameters, double *dnumbers);
 """
-DIFFERENTIATED = {"derivatives", "position_derivatives"}
-FUNCTIONS = {"run": SceneCode.run, "accelerations": SceneCode.accelerations, "projection": SceneCode.projection}
-FUNCTIONS |= {"derivatives": SceneCode.derivatives, "positions": SceneCode.positions}
-FUNCTIONS |= {"position_derivatives": SceneCode.position_derivatives}
+MARK = "/* Written by udkjax; a further export replaces this file of the scene "
+DIFFERENTIATED = {"step_derivatives", "derivatives", "position_derivatives"}
+FUNCTIONS: dict[str, Callable[[SceneCode], tuple[str, CUnit]]] = {name: getattr(SceneCode, name) for name in DOCUMENTED}
 
 
 class ExportedCode(NamedTuple):
@@ -125,11 +136,23 @@ def export_c(
     if "run" in units:
         found["main.c"] = _main(scene)
     to = Path(folder)
-    to.mkdir(parents=True, exist_ok=True)
+    mark = f"{MARK}{scene.prefix}. */\n"
+    _clear(to, found, mark)
     for name, text in found.items():
-        (to / name).write_text(text, encoding="ascii", errors="backslashreplace")
+        (to / name).write_text(mark + text, encoding="ascii", errors="backslashreplace")
     flops = max((unit.flops.get("accelerations", 0) for unit in units.values()), default=0)
     return ExportedCode([to / name for name in found], scene.prefix, {k: 8 * u.memory for k, u in units.items()}, flops)
+
+
+def _clear(folder: Path, names: Collection[str], mark: str) -> None:
+    """Make a folder, and remove the scene's earlier export from it: `cc *.c` would compile its files as well."""
+    folder.mkdir(parents=True, exist_ok=True)
+    heads = {file: file.read_bytes()[: len(mark)].decode(errors="replace") for file in folder.glob("*.[ch]") if file.is_file()}
+    if foreign := [file.name for file, head in heads.items() if file.name in names and not head.startswith(MARK)]:
+        raise ArgumentError(f"{folder} has {', '.join(foreign)}, which udkjax did not write: choose another folder")
+    for file, head in heads.items():
+        if head == mark:
+            file.unlink()
 
 
 def scene_files(scene: SceneCode, what: Sequence[str], parameters: Sequence[str]) -> tuple[dict[str, str], dict[str, CUnit]]:
@@ -147,16 +170,19 @@ def scene_files(scene: SceneCode, what: Sequence[str], parameters: Sequence[str]
 def _header(scene: SceneCode, units: dict[str, CUnit], parameters: dict[str, float]) -> str:
     p, big = scene.prefix, scene.prefix.upper()
     flops = max((unit.flops.get("accelerations", 0) for unit in units.values()), default=0)
-    fill = {"p": p, "N": f"{big}_COORDINATES", "info": ", ".join(RunStates.info_names)}
+    fill = {"loads": "; ".join(f"{name} on {body}" for name, body in scene.load_names)}
+    fill |= {"drivers": ", ".join(scene.mechanism.driver_names) or "none"}
+    fill = {key: comment_text(x) for key, x in fill.items()}
+    fill |= {"p": p, "N": f"{big}_COORDINATES", "info": ", ".join(RunStates.info_names)}
     memory = "\n".join(
         f"#define {big}_{k.upper()}_MEMORY {u.memory} /* numbers, {8 * u.memory} bytes */" for k, u in units.items()
     )
     documented = "\n".join(DOCUMENTED[name].format(**fill) for name in units)
     documented += f"\n{ALONG.format(p=p)}" if DIFFERENTIATED & {*units} else ""
-    bodies = ", ".join(scene.mechanism.body_names)
-    return f"""/* {(scene.mechanism.name or "a mechanism").replace("*/", "")}: written by udkjax {versions()["udkjax"]}.
+    bodies = comment_text(", ".join(scene.mechanism.body_names))
+    return f"""/* {comment_text(scene.mechanism.name or "a mechanism")}, by udkjax {versions()["udkjax"]}.
 
-   A state is q, with x and y (m) and the angle (rad) of each body ({bodies.replace("*/", "")}), and v, their rates. `numbers` are
+   A state is q, with x and y (m) and the angle (rad) of each body ({bodies}), and v, their rates. `numbers` are
    the scene's numbers, {p}_numbers or a copy with other parameters. `memory` is given by the caller: as many numbers as
    the constant of its function says, with any content. Functions keep nothing else, so that threads may call them at the
    same time, each with its own memory. The accelerations take {flops} operations, plus divisions and roots. */
@@ -173,7 +199,7 @@ def _header(scene: SceneCode, units: dict[str, CUnit], parameters: dict[str, flo
 extern const double {p}_numbers[{big}_NUMBERS];
 extern const double {p}_q0[{big}_COORDINATES], {p}_v0[{big}_COORDINATES]; /* the closed initial state */
 
-/* Write the numbers that depend on the parameters ({", ".join(parameters) or "none"}) into `values`. */
+/* Write the numbers that depend on the parameters ({comment_text(", ".join(parameters)) or "none"}) into `values`. */
 void {p}_set_parameters(const double *parameters, double *values);
 
 /* Describe the result of a run. */
@@ -214,7 +240,7 @@ def _main(scene: SceneCode) -> str:
     columns = [f"body.{b}.{x} [{u}]" for names, of in zip((("x", "y", "angle"), rates), units, strict=True)
                for b in bodies for x, u in zip(names, of, strict=True)]  # fmt: skip
     counts = ", ".join(f"info[{INFO[name]}]" for name in ("t", "tried", "accepted", "evaluations"))
-    heading = ",".join(["time [s]", *columns]).replace("\\", "\\\\").replace('"', '\\"')
+    heading = ",\n    ".join(string_text(f",{x}") for x in columns)
     return f"""/* Run the scene, and print its motion: a table with a row for each time. */
 #include <stdio.h>
 #include "{p}.h"
@@ -223,13 +249,17 @@ enum {{ N = {big}_COORDINATES, TIMES = {len(scene.ts)} }};
 
 static const double ts[TIMES] = {{
     {table(scene.ts)}}};
+static const char *const columns[] = {{
+    {heading}}};
 static double qs[TIMES * N], vs[TIMES * N], violation[TIMES], info[{big}_INFO], memory[{big}_RUN_MEMORY];
 
 int main(void)
 {{
     const int result = {p}_run({p}_numbers, ts, TIMES, {p}_q0, {p}_v0, qs, vs, violation, info, memory);
     double worst = 0.0;
-    puts("{heading}");
+    fputs("time [s]", stdout);
+    for (int i = 0; i < 2 * N; i++) fputs(columns[i], stdout);
+    putchar('\\n');
     for (int k = 0; k < TIMES; k++) {{
         printf("%.17g", ts[k]);
         for (int i = 0; i < N; i++) printf(",%.17g", qs[k * N + i]);

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from udkjax.equations.laws.abstract_system import AbstractSystem
 from udkjax.equations.programs.scene_programs import scene_programs
 from udkjax.equations.rows.analysis import analyse
 from udkjax.integrate.compiled_mechanism import compile_concrete, evaluation_of
@@ -24,9 +25,10 @@ from udkjax.native.module.steps import SMALLEST_STEP, Status
 from udkjax.native.operations import Operation, StateOperation
 from udkjax.native.position_operations import Close
 from udkjax.native.runs import RunStates
+from udkjax.pinv import SVD
 from udkjax.positions.assembling.assembly import State, assemble
 from udkjax.requirements import ArgumentError
-from udkjax.scene.elements.bodies import COORDINATES
+from udkjax.scene.elements.bodies import COORDINATES, GROUND
 from udkjax.scene.mechanism import Mechanism
 from udkjax.wording import quote
 
@@ -39,6 +41,7 @@ RESULTS = {
     Status.SPURIOUS_RANK: Result.spurious_rank,
     Status.MISSING_RANK: Result.missing_rank,
 }
+OTHER_FILES = "fmi3", "fmu", "model"  # names of the headers and sources of an FMU
 INFO = {name: k for k, name in enumerate(RunStates.info_names)}  # places in the result "info"
 
 
@@ -61,6 +64,7 @@ class SceneCode:
         given, analysis, choices = with_held_pins(mechanism, None, None, choices)
         self.mechanism: Mechanism = given
         refuse_what_needs_python(self.mechanism)
+        self._choices = choices
         self.ts, self.analysis = ts, analyse(self.mechanism) if analysis is None else analysis
         self.state = assemble(self.mechanism, float(ts[0]))
         self.compiled = compile_concrete(self.mechanism, self.analysis, *choices.of_mechanism)
@@ -74,8 +78,8 @@ class SceneCode:
         self.problem: Problem = prepare_run(self.compiled, self.analysis, ts, start, None, choices, np).problem
         assert plan.operation is not None  # there is machine code
         self.operation = plan.operation if stiff else replace(plan.operation, changes=False, leaves=False)
-        self.prefix = re.sub(r"\W+", "_", mechanism.name or "scene").strip("_").lower()
-        if not re.match(r"[a-z]", self.prefix):
+        self.prefix = re.sub(r"[^a-z0-9]+", "_", (mechanism.name or "scene").lower()).strip("_")
+        if self.prefix in OTHER_FILES or not re.match(r"[a-z]", self.prefix):
             self.prefix = f"scene_{self.prefix}"
 
     @property
@@ -102,26 +106,74 @@ class SceneCode:
 
     def run(self) -> tuple[str, CUnit]:
         """Return `run` and `step`."""
-        unit, p = c_unit(self.operation), self.prefix
-        settings = dict(zip(self.operation.all_settings, self.inputs["settings"], strict=True))
+        unit, text = self._integration(self.operation)
+        return (
+            f"""{text}
+int {self.prefix}_run(const double *numbers, const double *ts, int times, const double *q, const double *v, double *qs,
+    double *vs, double *violation, double *info, double *memory)
+{{
+    return integrate(numbers, ts, times, q, v, qs, vs, violation, info, memory, 0.0, {number_text(self._settings["max_steps"])});
+}}
+{self._step("step", "double *q, double *v")}""",
+            unit,
+        )
+
+    def step_derivatives(self) -> tuple[str, CUnit]:
+        """Return `step` with its derivative along a direction."""
+        if self.operation.sampled:
+            raise ArgumentError("no C for derivatives of steps with tables over time: export the run alone")
+        operation = self.operation.with_tangents((True,) * self.operation.code.number_count)
+        unit, text = self._integration(operation, ("dnumbers", "dq", "dv"), ("dys", "dend"))
+        arguments = "double *q, double *v, const double *dnumbers,\n    double *dq, double *dv"
+        return text + self._step("step_along", arguments, ("dnumbers", "dq", "dv"), ("dys", "dend")), unit
+
+    def _step(self, name: str, state: str, along: Sequence[str] = (), found: Sequence[str] = ()) -> str:
+        """Return a function that integrates over one interval, with a direction if any is given."""
+        n, further = self.n, "".join(f", {x}" for x in (*along, *found))
+        declared = "".join(f", {x}[{4 * n}]" for x in found)
+        copied = [f"        memcpy(d{x}, dys + {k * n}, {n} * sizeof *d{x});" for k, x in ((2, "q"), (3, "v")) if along]
+        return f"""
+int {self.prefix}_{name}(const double *numbers, double t, double dt, {state}, double *memory)
+{{
+    double ts[2], qs[{2 * n}], vs[{2 * n}], violation[2], info[{len(INFO) + 2 * n}]{declared};
+    ts[0] = t;
+    ts[1] = t + dt;
+    const double most_steps = {number_text(MOST_STEPS_OF_INTERVAL)};
+    const int result = integrate(numbers, ts, 2, q, v, qs, vs, violation, info, memory, dt, most_steps{further});
+    if (!result) {{
+        memcpy(q, qs + {n}, {n} * sizeof *q);
+        memcpy(v, vs + {n}, {n} * sizeof *v);
+{"".join(f"{line}{chr(10)}" for line in copied)}    }}
+    return result;
+}}
+"""
+
+    @property
+    def _settings(self) -> dict[str, float]:
+        return dict(zip(self.operation.all_settings, self.inputs["settings"].tolist(), strict=True))
+
+    def _integration(self, operation: Operation, along: Sequence[str] = (), found: Sequence[str] = ()) -> tuple[CUnit, str]:
+        """Return the unit of an operation that integrates, and its C with the function `integrate`."""
+        unit = c_unit(operation, int(bool(along)))
         rate, length = (number_text(float(x)) for x in (self.analysis.scales.rate, self.analysis.scales.length))
         results = [int(RESULTS.get(k, Result.step_too_small)) for k in range(Status.MISSING_RANK + 1)]
-        values = {"numbers": "numbers", "ts": "ts", "q": "q", "v": "v", "settings": "own", "rows": "rows", "breaks": "breaks"}
-        values |= {"times": "times", "knots": str(len(self.inputs["breaks"]))}
-        values |= {"samples": "samples"} if self.operation.sampled else {}
-        values |= {"qs": "qs", "vs": "vs", "violation": "violation", "info": "info"}
-        columns = {name: k for k, name in enumerate(self.operation.all_settings)}
-        text = f"""
+        arrays = ("numbers", "ts", "q", "v", "rows", "breaks", "times", "qs", "vs", "violation", "info", *along, *found)
+        arrays += ("samples",) if self.operation.sampled else ()
+        values = dict(zip(arrays, arrays, strict=True)) | {"settings": "own", "knots": str(len(self.inputs["breaks"]))}
+        values |= {"directions": "1"} if along else {}
+        columns = {name: k for k, name in enumerate(self._settings)}
+        further = "".join(f", const double *{x}" for x in along) + "".join(f", double *{x}" for x in found)
+        text = f"""{unit.text}
 {_arrays(rows=self.inputs["rows"], breaks=self.inputs["breaks"], samples=self.inputs.get("samples", np.zeros(0)))}
-static const double settings[] = {{ /* {", ".join(settings)} */
-    {", ".join(map(number_text, settings.values()))}}};
+static const double settings[] = {{ /* {", ".join(columns)} */
+    {", ".join(map(number_text, self._settings.values()))}}};
 static const int results[] = {{{", ".join(map(str, results))}}}; /* of a run, by its status */
 
 static double larger(double a, double b) {{ return a > b ? a : b; }}
 
 /* Integrate from ts[0] to the last time; `first` is the step to try, 0 if it is chosen. */
 static int integrate(const double *numbers, const double *ts, int times, const double *q, const double *v, double *qs, double *vs,
-    double *violation, double *info, double *memory, double first, double most_steps)
+    double *violation, double *info, double *memory, double first, double most_steps{further})
 {{
     double own[sizeof settings / sizeof *settings], lengths = 0.0, angles = 0.0;
     memcpy(own, settings, sizeof settings);
@@ -138,28 +190,8 @@ static int integrate(const double *numbers, const double *ts, int times, const d
     if (info[{INFO["lost"]}] < times) return info[{INFO["lost"]}] > 0 ? {int(Result.drift)} : {int(Result.initial_state_open)};
     return results[(int)info[{INFO["code"]}]];
 }}
-
-int {p}_run(const double *numbers, const double *ts, int times, const double *q, const double *v, double *qs, double *vs,
-    double *violation, double *info, double *memory)
-{{
-    return integrate(numbers, ts, times, q, v, qs, vs, violation, info, memory, 0.0, {number_text(settings["max_steps"])});
-}}
-
-int {p}_step(const double *numbers, double t, double dt, double *q, double *v, double *memory)
-{{
-    double ts[2], qs[{2 * self.n}], vs[{2 * self.n}], violation[2], info[{len(INFO) + 2 * self.n}];
-    ts[0] = t;
-    ts[1] = t + dt;
-    const double most_steps = {number_text(MOST_STEPS_OF_INTERVAL)};
-    const int result = integrate(numbers, ts, 2, q, v, qs, vs, violation, info, memory, dt, most_steps);
-    if (!result) {{
-        memcpy(q, qs + {self.n}, {self.n} * sizeof *q);
-        memcpy(v, vs + {self.n}, {self.n} * sizeof *v);
-    }}
-    return result;
-}}
 """
-        return unit.text + text, unit
+        return unit, text
 
     def accelerations(self) -> tuple[str, CUnit]:
         """Return `accelerations`."""
@@ -202,6 +234,41 @@ int {p}_step(const double *numbers, double t, double dt, double *q, double *v, d
         return self._closing(operation, head, f"    double found[{2 * self.n}];\n", {"state": "found"} | along)
 
     @property
+    def load_names(self) -> list[tuple[str, str]]:
+        """The constraint and the body of each load."""
+        frames = {name: self.mechanism.frames_of(x) for name, x in self.mechanism.constraints.items()}
+        return [(name, body) for name, bodies in frames.items() for body in dict.fromkeys(bodies) if body != GROUND]
+
+    def reactions(self) -> tuple[str, CUnit]:
+        """Return `reactions`."""
+        if self.operation.code.rubs:
+            why = "give the friction a torque instead of a coefficient, or compute them by udkjax.reactions"
+            raise ArgumentError(f"no C for reactions with friction that depends on them: {why}")
+        method = self._choices._replace(method=SVD()).of_mechanism
+        equations = compile_concrete(self.mechanism, self.analysis, *method).equations
+        operation, names = self._evaluation(equations).reactions, self.load_names
+        found = scene_inputs(equations, equations.textbook.mechanism, operation.code.policy, np)
+        owners = [name for name, _ in self.analysis.row_names]
+        rows, columns, places, factors = operation.code.psi_q_entries
+        pairs = zip(rows, columns, strict=True)
+        to = [3 * names.index((owners[i], self.mechanism.body_names[j // 3])) + j % 3 for i, j in pairs]
+        own = {"row": rows, "entry": places, "load": to, "driven": [owners.index(x) for x in self.mechanism.driver_names] or [0]}
+        integers = [f"    static const int {name}[] = {{{', '.join(map(str, x))}}};" for name, x in own.items()]
+        m, count = len(owners), len(self._own_numbers)
+        before = f"""    double found[{m + max(places) + 1}], own[{count + 2}] = {{0.0}};
+{chr(10).join(integers)}
+    static const double factor[] = {{{table(factors)}}};
+    memcpy(own, numbers, {count} * sizeof *own);
+"""
+        after = f"""    memset(loads, 0, {3 * len(names)} * sizeof *loads);
+    for (int i = 0; i < {len(rows)}; i++) loads[load[i]] -= factor[i] * found[{m} + entry[i]] * found[row[i]];
+    for (int i = 0; i < {len(self.mechanism.driver_names)}; i++) efforts[i] = -found[driven[i]];
+"""
+        head = f"""void {self.prefix}_reactions(const double *numbers, double t, const double *q, const double *v, double *loads,
+    double *efforts, double *memory)"""
+        return self._of_state(operation, head, {"numbers": "own", "found": "found"}, before, after, found.settings)
+
+    @property
     def _close(self) -> Close:
         return Close(scene_programs(self.mechanism).with_all_rows)
 
@@ -219,9 +286,12 @@ int {p}_step(const double *numbers, double t, double dt, double *q, double *v, d
 
     @property
     def evaluation(self) -> StateOperation:
-        operation = evaluation_of(self.compiled.equations)
+        return self._evaluation(self.compiled.equations)
+
+    def _evaluation(self, equations: AbstractSystem) -> StateOperation:
+        operation = evaluation_of(equations)
         if operation is None:
-            raise ArgumentError("no C for accelerations and projections of a scene without constraints: export its run")
+            raise ArgumentError("no C for single states of a scene without constraints: export its run")
         if self.operation.sampled:
             raise ArgumentError("no C for single states of a scene with tables over time: export its run")
         return operation
@@ -308,5 +378,6 @@ def refuse_what_needs_python(mechanism: Mechanism) -> None:
         joints = [force.joint for force in mechanism.forces.values() if getattr(force, "sticks", False)]
         names = ", ".join(map(quote, joints))
         raise ArgumentError(f'no C for joints that stick ({names}): give their friction law="smooth"')
-    if mechanism.may_have_kinks and kinks_of(mechanism).are_held:
-        raise ArgumentError("no C for forces with jumps or kinks that depend on the state: make them smooth")
+    if mechanism.may_have_kinks and (held := kinks_of(mechanism).held):
+        names = ", ".join(map(quote, held))
+        raise ArgumentError(f"no C for forces with jumps or kinks that depend on the state ({names}): make them smooth")

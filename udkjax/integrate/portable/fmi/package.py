@@ -4,9 +4,9 @@ import hashlib
 import json
 import tempfile
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from udkjax.integrate.portable.fmi.compilers import SUFFIXES, Platform, compile_
 from udkjax.integrate.portable.fmi.description import KINDS, build_description, model_description
 from udkjax.integrate.portable.fmi.variables import FMUVariables, least_of
 from udkjax.integrate.portable.parameters import guess_of, places_of_numbers
+from udkjax.native.c import string_text
 from udkjax.requirements import ArgumentError
 from udkjax.scene.arguments import checked
 from udkjax.scene.mechanism import Mechanism
@@ -180,13 +181,9 @@ static const char *const value_names[VALUES + 1] = {{{_texts([*(x.name for x in 
 """
 
 
-def _texts(names: Any) -> str:
+def _texts(names: Iterable[str]) -> str:
     """Return names as constants of C."""
-    return ",\n    ".join('"' + "".join(_letter(x) for x in name.encode()) + '"' for name in names)
-
-
-def _letter(byte: int) -> str:
-    return chr(byte) if 32 <= byte < 127 and chr(byte) not in '"\\?' else f"\\{byte:03o}"
+    return ",\n    ".join(map(string_text, names))
 
 
 def _write(
