@@ -15,7 +15,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 import udkjax as udk
 from tests.command_line import udkjax
-from tests.integrate.portable.test_export_c import DRAWINGS, fused
+from tests.integrate.portable.test_export_c import DRAWINGS, fused, scene
 from udkjax.integrate.portable.fmi.compilers import SUFFIXES, this_platform
 from udkjax.integrate.portable.fmi.description import base_unit
 
@@ -313,10 +313,6 @@ def test_what_cannot_be_exported_is_refused(tmp_path, capsys):
     assert udkjax("export", "compound_pendulum") == 2 and "--fmu FILE" in capsys.readouterr().err
     assert udkjax("export", "compound_pendulum", "--fmu", file, "--kinds", "co-simulation", "--no-stiff", "--json") == 0
     assert file.exists()
-
-
-def scene(name: str) -> udk.Mechanism:
-    return udk.load(name) if name.endswith(".toml") else getattr(udk.library, name)(*([3] if name == "n_four_bar" else []))
 
 
 @pytest.mark.slow

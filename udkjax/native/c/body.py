@@ -43,6 +43,8 @@ class FunctionBody(Instructions):
         for kind, n in self._f.arguments:
             self._known[n] = CExpression(n, kind, set(), self._f.elements.get(n, "double"))
         self._uses = Counter(x for line in self._f.lines for x in re.findall(r"%([\w.]+)", right_side(line)))
+        places = (re.search(r"(?:load \w+|^store .*), ptr %([\w.]+)(?:,|$)", line) for line in self._f.lines)
+        self._direct = Counter(place[1] for place in places if place)
         lines = self._f.lines
         for k, line in enumerate(lines):
             self._line(line, lines[k + 1] if k + 1 < len(lines) else "")
@@ -172,8 +174,7 @@ class FunctionBody(Instructions):
         match = re.match(r"alloca (\w+), i64 (\d+)", text)
         assert match, text
         kind = "double *" if match[1] == "ptr" else f"{TYPES[match[1]]} "
-        others = [x for x in self._f.lines if re.search(rf"%{re.escape(name)}\b", x) and not x.startswith(f"%{name} =")]
-        direct = all(re.search(rf"(?:load \w+|store .*), ptr %{re.escape(name)}(?:,|$)", x) for x in others)
+        direct = self._uses[name] == self._direct[name]
         if int(match[2]) == 1 and direct:
             self._slots[name] = name
             self._variables.append(f"    {kind}{name} = 0;")

@@ -3,6 +3,7 @@
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cache
 
 from udkjax.native.c.names import Names
 from udkjax.native.c.translation import translated
@@ -84,8 +85,8 @@ def c_function(function: Function) -> str:
 def count_operations(text: str) -> dict[str, int]:
     """Count the operations on numbers of each function of a module and of the functions that it calls."""
     bodies = {m[1]: m[2].split("\n") for m in re.finditer(r"^define [^@]*@(\w+)\([^{]*\{\n(.*?)\n\}", text, re.M | re.S)}
-    found: dict[str, int] = {}
 
+    @cache
     def count(name: str, length: int = 1) -> int:
         """Count the operations of a function whose loops over `count` have this length."""
         total, factors, lines = 0, [1], bodies[name]
@@ -106,6 +107,4 @@ def count_operations(text: str) -> dict[str, int]:
                 total += factors[-1] * next((n for word, n in FLOPS.items() if operation.startswith(word)), 0)
         return total
 
-    for name in bodies:
-        found[name] = count(name)
-    return found
+    return {name: count(name) for name in bodies}

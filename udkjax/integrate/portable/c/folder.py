@@ -1,5 +1,6 @@
 """A folder of C99 that runs a scene: `export_c`."""
 
+import re
 from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
@@ -240,7 +241,8 @@ def _main(scene: SceneCode) -> str:
     columns = [f"body.{b}.{x} [{u}]" for names, of in zip((("x", "y", "angle"), rates), units, strict=True)
                for b in bodies for x, u in zip(names, of, strict=True)]  # fmt: skip
     counts = ", ".join(f"info[{INFO[name]}]" for name in ("t", "tried", "accepted", "evaluations"))
-    heading = ",\n    ".join(string_text(f",{x}") for x in columns)
+    quoted = [f'"{x.replace(chr(34), 2 * chr(34))}"' if re.search(r'[",\n\r]', x) else x for x in columns]  # as in tables of runs
+    heading = ",\n    ".join(string_text(f",{x}") for x in quoted)
     return f"""/* Run the scene, and print its motion: a table with a row for each time. */
 #include <stdio.h>
 #include "{p}.h"

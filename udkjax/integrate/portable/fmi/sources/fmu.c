@@ -338,13 +338,18 @@ NO_VARIABLES(String, fmi3String)
 
 /* --- the state of the FMU */
 
+static fmi3Status keep_state(const Instance *m, const State *s, fmi3FMUState *state)
+{
+    if (!*state) *state = malloc(sizeof *s);
+    if (!*state) return report(m, fmi3Error, "no memory for a state");
+    memcpy(*state, s, sizeof *s);
+    return fmi3OK;
+}
+
 FMI fmi3Status fmi3GetFMUState(fmi3Instance instance, fmi3FMUState *state)
 {
     REQUIRE(ANY);
-    if (!*state) *state = malloc(sizeof(State));
-    if (!*state) return report(m, fmi3Error, "no memory for a state");
-    memcpy(*state, &m->now, sizeof(State));
-    return fmi3OK;
+    return keep_state(m, &m->now, state);
 }
 
 FMI fmi3Status fmi3SetFMUState(fmi3Instance instance, fmi3FMUState state)
@@ -389,12 +394,11 @@ FMI fmi3Status fmi3SerializeFMUState(fmi3Instance instance, fmi3FMUState state, 
 FMI fmi3Status fmi3DeserializeFMUState(fmi3Instance instance, const fmi3Byte bytes[], size_t size, fmi3FMUState *state)
 {
     REQUIRE(ANY);
-    if (size != SERIALIZED || memcmp(bytes, TOKEN, sizeof TOKEN))
+    State s = {0};
+    if (size == SERIALIZED) memcpy(&s, bytes + sizeof TOKEN, sizeof s);
+    if (size != SERIALIZED || memcmp(bytes, TOKEN, sizeof TOKEN) || !(s.mode & ANY) || s.mode & (s.mode - 1))
         return report(m, fmi3Error, "the bytes are not a serialized state of this FMU");
-    if (!*state) *state = malloc(sizeof(State));
-    if (!*state) return report(m, fmi3Error, "no memory for a state");
-    memcpy(*state, bytes + sizeof TOKEN, sizeof(State));
-    return fmi3OK;
+    return keep_state(m, &s, state);
 }
 
 /* --- co-simulation */
