@@ -6,7 +6,11 @@ from collections.abc import Iterable
 from typing import Any
 
 # What installs a package that tests import, by the option of install.sh.
-OPTIONS = {"--test": ("wasmtime", "mujoco"), "--fmi": ("fmpy",), "--notebook": ("nbformat", "nbconvert", "ipykernel", "IPython")}
+OPTIONS = {
+    "--test": ("wasmtime", "mujoco"),
+    "--fmi": ("fmpy", "ziglang"),
+    "--notebook": ("nbformat", "nbconvert", "ipykernel", "IPython"),
+}
 
 
 def skipped_for(reports: Iterable[Any]) -> list[str]:

@@ -25,6 +25,7 @@ EXTRAS = {
     "tyro": "cli",
     "uvicorn": "studio",
     "xarray": "io",
+    "ziglang": "zig",
 }
 # Extras that others bring along.
 BRINGS = {
@@ -42,6 +43,7 @@ WRITERS = {".png": ("PIL",), ".gif": ("PIL",), ".mp4": ("PIL", "imageio_ffmpeg")
 NETCDF = "xarray", "h5netcdf"  # the packages that read and write runs
 BAYES = ("arviz",)  # the package that judges draws from posteriors
 EXPORT = ("flatbuffers",)  # the package with which JAX writes exported functions
+ZIG = ("ziglang",)  # the package with a C compiler for all platforms
 STUDIO = "starlette", "uvicorn", "tomlkit"  # the packages that serve the studio
 
 

@@ -6,6 +6,9 @@ from typing import Any, Literal
 from udkjax.cli.common import Json, Scene, load, output_times, refuse, show
 from udkjax.cli.datasets import check_folder
 
+What = Literal[
+    "run", "step_derivatives", "accelerations", "derivatives", "projection", "positions", "position_derivatives", "reactions"
+]
 FUNCTIONS = "run", "accelerations"  # of C by default
 
 
@@ -14,9 +17,7 @@ def export(
     /,
     c: Path | None = None,
     fmu: Path | None = None,
-    what: tuple[
-        Literal["run", "accelerations", "derivatives", "projection", "positions", "position_derivatives"], ...
-    ] = FUNCTIONS,
+    what: tuple[What, ...] = FUNCTIONS,
     kinds: tuple[Literal["co-simulation", "model-exchange"], ...] = ("co-simulation", "model-exchange"),
     parameters: tuple[str, ...] | None = None,
     inputs: tuple[str, ...] | None = None,
@@ -40,7 +41,7 @@ def export(
         parameters: numbers of the scene that can be set before a run, such as body.link1.mass or pin.A; by default none in C, and
             all in an FMU.
         inputs: numbers of the scene that can be set during a run of an FMU; by default those of torques and forces.
-        platforms: platforms of the FMU, such as x86_64-linux; by default this one. Others need the package ziglang.
+        platforms: platforms of the FMU, such as x86_64-linux; by default this one. Others need the extra zig.
         t1: end of the program's run, or of the FMU's default experiment (s).
         dt: time between outputs, or the step of the default experiment (s).
         t0: start of the run (s).

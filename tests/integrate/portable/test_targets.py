@@ -70,6 +70,7 @@ def as_fmu(kind: str) -> Callable[[udk.Mechanism, Path], object]:
 
 TARGETS = {
     "C, run": in_c("run"),
+    "C, reactions": in_c("reactions"),
     "C, other functions": in_c("accelerations", "derivatives", "projection"),
     "FMU, co-simulation": as_fmu("co-simulation"),
     "FMU, model exchange": as_fmu("model-exchange"),

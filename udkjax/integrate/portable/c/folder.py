@@ -111,8 +111,8 @@ def export_c(
         mechanism: the scene, with concrete numbers. Its thresholds of rank follow from these numbers.
         folder: the folder to write, which is made if it does not exist.
         what: functions to write: "run", a step with projection and whole runs; "accelerations"; their "derivatives" along a
-            direction; "projection" of a state; "positions", closed from a guess, as for a mechanism that is driven; and
-            "position_derivatives", the derivatives of these along a direction.
+            direction; "step_derivatives", of a step; "projection" of a state; "positions", closed from a guess, as for a driven
+            mechanism; "position_derivatives"; and "reactions", loads of joints and efforts of drivers.
         ts: output times of the program (s); by default 0 to 20 s in steps of 0.05 s.
         parameters: names of numbers that a function of the C changes, as in `with_parameters`.
         rtol: relative tolerance of a step.
@@ -123,7 +123,8 @@ def export_c(
         The files, with the memory and the operations that functions need.
 
     Raises:
-        ArgumentError: the scene has joints that stick, forces with kinks, or equations without machine code.
+        ArgumentError: the scene has joints that stick, forces with kinks, or equations without machine code; or the folder has
+            a file of other origin that would be replaced.
         AssemblyError: the initial guess cannot be closed.
     """
     times = 0.05 * np.arange(401) if ts is None else np.asarray(ts, float)

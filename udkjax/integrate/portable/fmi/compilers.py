@@ -1,4 +1,4 @@
-"""C compilers for the platforms of FMUs: the compiler of this machine, and the wheel `ziglang` for all platforms."""
+"""C compilers for the platforms of FMUs: the compiler of this machine, and the extra `zig` for all platforms."""
 
 import platform
 import shutil
@@ -9,6 +9,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Literal, get_args
 
+from udkjax.extras import ZIG, cure
 from udkjax.requirements import ArgumentError
 
 Platform = Literal["x86_64-linux", "aarch64-linux", "x86_64-windows", "x86_64-darwin", "aarch64-darwin"]  # as in FMI
@@ -40,9 +41,8 @@ def compiler_for(name: str) -> list[str]:
         raise ArgumentError(f"platforms must be among {', '.join(get_args(Platform))}, not {name}")
     if name == this_platform() and (own := next(filter(None, map(shutil.which, ("cc", "gcc", "clang"))), None)):
         return [own]
-    if find_spec("ziglang") is None:
-        cure = "pip install ziglang, which compiles for all platforms, or give platforms=[] for an FMU of sources"
-        raise ArgumentError(f"there is no C compiler for {name}: {cure}")
+    if find_spec(*ZIG) is None:
+        raise ArgumentError(f"there is no C compiler for {name}: {cure(ZIG)}, or give platforms=[] for an FMU of sources")
     return [sys.executable, "-m", "ziglang", "cc", "-target", TARGETS[name]]
 
 

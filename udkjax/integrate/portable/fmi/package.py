@@ -91,7 +91,7 @@ def export_fmu(
         rtol: relative tolerance of a step, in co-simulation.
         atol: absolute tolerance of a step, in units of the scene's characteristic length and time.
         stiff: whether co-simulation goes on by an implicit method where it is stiff.
-        platforms: platforms to compile for, such as "x86_64-linux"; None: this one. Others need the package `ziglang`.
+        platforms: platforms to compile for, such as "x86_64-linux"; None: this one. Others need the extra `zig`.
         options: options of the C compiler, such as ["-O2", "-march=native"].
 
     Returns:
