@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import udkjax as udk
+from udkjax.positions.assembling.channel_values import measure
 from udkjax.positions.assembling.channels import channel_of
-from udkjax.study.channel_values import measure
 from udkjax.study.identify.problem.parameters import unknowns_of
 from udkjax.study.identify.problem.unknowns import Unknowns, apply_values
 

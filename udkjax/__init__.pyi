@@ -72,6 +72,7 @@ from udkjax.positions.answers.transmission import workspace as workspace
 from udkjax.positions.assembling.assembly import AssemblyError as AssemblyError
 from udkjax.positions.assembling.assembly import State as State
 from udkjax.positions.assembling.assembly import assemble as assemble
+from udkjax.positions.assembling.channel_values import path as path
 from udkjax.positions.assembling.coordinates import Coordinate as Coordinate
 from udkjax.positions.following.branches import branches as branches
 from udkjax.positions.following.continuation import Reached as Reached
@@ -165,7 +166,6 @@ from udkjax.study.belief import compare as compare
 from udkjax.study.belief import design_experiment as design_experiment
 from udkjax.study.belief import inference as inference
 from udkjax.study.belief import sample as sample
-from udkjax.study.channel_values import path as path
 from udkjax.study.diagnosis import Diagnosis as Diagnosis
 from udkjax.study.diagnosis import SystemDiagnosis as SystemDiagnosis
 from udkjax.study.diagnosis import diagnose as diagnose

@@ -11,9 +11,9 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax as udk
+from udkjax.positions.assembling.channel_values import measure
 from udkjax.positions.assembling.channels import Quantity, channel_of, channels_of
 from udkjax.programs.deferred import deferred
-from udkjax.study.channel_values import measure
 
 OMEGA, STEP = 4.0, 1e-3
 TIMES = 0.3 + STEP * np.arange(-6, 7)

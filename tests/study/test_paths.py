@@ -9,8 +9,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax as udk
+from udkjax.positions.assembling.channel_values import measure
 from udkjax.positions.assembling.channels import channel_of
-from udkjax.study.channel_values import measure
 
 ORDERS: tuple[Literal[0, 1, 2], ...] = (0, 1, 2)  # positions, velocities, accelerations
 TIP = (0.3, -0.1)

@@ -133,8 +133,8 @@ def measure_channels(mech: "Mechanism", motion: "StateHistory", channels: "Seque
     """Return the values of channels along a motion."""
     import numpy as np
 
+    from udkjax.positions.assembling.channel_values import measure
     from udkjax.programs.deferred import deferred
-    from udkjax.study.channel_values import measure
 
     if not channels:
         return {}

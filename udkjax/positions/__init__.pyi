@@ -31,6 +31,8 @@ from udkjax.positions.assembling.assembly import close as close
 from udkjax.positions.assembling.assembly import moves_from_guess as moves_from_guess
 from udkjax.positions.assembling.assembly import moves_of_assembly as moves_of_assembly
 from udkjax.positions.assembling.assembly import require_closed as require_closed
+from udkjax.positions.assembling.channel_values import measure as measure
+from udkjax.positions.assembling.channel_values import path as path
 from udkjax.positions.assembling.channels import LOADS as LOADS
 from udkjax.positions.assembling.channels import RATES as RATES
 from udkjax.positions.assembling.channels import UNITS as UNITS
@@ -40,7 +42,6 @@ from udkjax.positions.assembling.channels import StateHistory as StateHistory
 from udkjax.positions.assembling.channels import channel_of as channel_of
 from udkjax.positions.assembling.channels import has_point as has_point
 from udkjax.positions.assembling.channels import locate as locate
-from udkjax.positions.assembling.channels import point_of_pin as point_of_pin
 from udkjax.positions.assembling.coordinates import Coordinate as Coordinate
 from udkjax.positions.assembling.coordinates import element_of as element_of
 from udkjax.positions.assembling.coordinates import slopes_of as slopes_of

@@ -12,8 +12,6 @@ from udkjax.study.belief import compare as compare
 from udkjax.study.belief import design_experiment as design_experiment
 from udkjax.study.belief import inference as inference
 from udkjax.study.belief import sample as sample
-from udkjax.study.channel_values import measure as measure
-from udkjax.study.channel_values import path as path
 from udkjax.study.choices import choice as choice
 from udkjax.study.diagnosis import Diagnosis as Diagnosis
 from udkjax.study.diagnosis import SystemDiagnosis as SystemDiagnosis

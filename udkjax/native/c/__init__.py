@@ -3,7 +3,7 @@
 `c_unit` makes the C of an operation for one member, whose memory the caller gives; `c_function` translates one function.
 """
 
-from udkjax.native.c.syntax import comment_text, number_text, string_text
+from udkjax.native.c.syntax import number_text
 from udkjax.native.c.unit import CUnit, c_function, c_unit
 
-__all__ = ["CUnit", "c_function", "c_unit", "comment_text", "number_text", "string_text"]
+__all__ = ["CUnit", "c_function", "c_unit", "number_text"]

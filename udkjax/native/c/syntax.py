@@ -68,17 +68,6 @@ def number_text(number: float) -> str:
     return repr(float(number))
 
 
-def string_text(text: str) -> str:
-    """Return a string in C, in UTF-8."""
-    letters = [chr(x) if 32 <= x < 127 and chr(x) not in '"\\?' else f"\\{x:03o}" for x in text.encode()]
-    return f'"{"".join(letters)}"'
-
-
-def comment_text(text: str) -> str:
-    """Return a text that can stand in a comment of C."""
-    return text.replace("*/", "* /").replace("/*", "/ *")
-
-
 def operand(text: str) -> str:
     """Return an expression as an operand."""
     if re.fullmatch(r"[\w.]+|\w+\([^()]*\)|\w+\[[^\[\]]*\]", text) or _is_call(text):

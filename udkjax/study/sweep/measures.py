@@ -18,9 +18,9 @@ from udkjax.equations.states.scene_changes import scene_along
 from udkjax.equations.systems.general import ConstrainedSystem
 from udkjax.integrate.solution import Solution
 from udkjax.pinv import SVD, Auto, Pseudoinverse
+from udkjax.positions.assembling.channel_values import measure as evaluate_channels
 from udkjax.positions.assembling.channels import Channel, channel_of
 from udkjax.scene.mechanism import Mechanism
-from udkjax.study.channel_values import measure as evaluate_channels
 from udkjax.study.quantities import StudyModel
 from udkjax.study.sweep.dimensions import refuse_untraceable
 from udkjax.wording import quote, suggestion

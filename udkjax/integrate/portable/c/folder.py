@@ -9,9 +9,9 @@ import numpy as np
 
 from udkjax.annotations import Numbers
 from udkjax.argument_types import NOT_NEGATIVE
-from udkjax.integrate.portable.c.scene import INFO, SceneCode, table
+from udkjax.integrate.portable.c.scene import INFO, SceneCode, comment_text, string_text, table
 from udkjax.integrate.solution import Result, versions
-from udkjax.native.c import CUnit, comment_text, string_text
+from udkjax.native.c import CUnit
 from udkjax.native.runs import RunStates
 from udkjax.requirements import ArgumentError
 from udkjax.scene.arguments import checked

@@ -372,6 +372,17 @@ def table(values: np.ndarray) -> str:
     return ",\n    ".join(", ".join(texts[k : k + 6]) for k in range(0, len(texts), 6))
 
 
+def string_text(text: str) -> str:
+    """Return a string in C, in UTF-8."""
+    letters = [chr(x) if 32 <= x < 127 and chr(x) not in '"\\?' else f"\\{x:03o}" for x in text.encode()]
+    return f'"{"".join(letters)}"'
+
+
+def comment_text(text: str) -> str:
+    """Return a text that can stand in a comment of C."""
+    return text.replace("*/", "* /").replace("/*", "/ *")
+
+
 def refuse_what_needs_python(mechanism: Mechanism) -> None:
     """Raise an error for a scene whose run needs events, which Python applies."""
     if may_stick(mechanism):

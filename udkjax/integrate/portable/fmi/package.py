@@ -13,12 +13,11 @@ import numpy as np
 from udkjax.argument_types import NOT_NEGATIVE, POSITIVE
 from udkjax.equations.rows.position_closure import CLOSURE
 from udkjax.integrate.portable.c.folder import scene_files
-from udkjax.integrate.portable.c.scene import SceneCode, table
+from udkjax.integrate.portable.c.scene import SceneCode, string_text, table
 from udkjax.integrate.portable.fmi.compilers import SUFFIXES, Platform, compile_library, compiler_for, this_platform
 from udkjax.integrate.portable.fmi.description import KINDS, build_description, model_description
 from udkjax.integrate.portable.fmi.variables import FMUVariables, least_of
 from udkjax.integrate.portable.parameters import guess_of, places_of_numbers
-from udkjax.native.c import string_text
 from udkjax.requirements import ArgumentError
 from udkjax.scene.arguments import checked
 from udkjax.scene.mechanism import Mechanism

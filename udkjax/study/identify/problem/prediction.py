@@ -20,9 +20,9 @@ from udkjax.annotations import NumericArray
 from udkjax.devices import computing_on_host, on_host
 from udkjax.integrate.simulate import simulate
 from udkjax.positions.assembling.assembly import State, close
+from udkjax.positions.assembling.channel_values import measure
 from udkjax.positions.assembling.channels import Channel, Quantity
 from udkjax.scene.elements.held import Held
-from udkjax.study.channel_values import measure
 from udkjax.study.identify.problem.unknowns import Target, apply_values
 from udkjax.study.members import MOST_PROGRAMS, PIECE_MEMBERS, Program, structure_of
 from udkjax.study.quantities import StudyModel
