@@ -21,6 +21,7 @@ def export(
     kinds: tuple[Literal["co-simulation", "model-exchange"], ...] = ("co-simulation", "model-exchange"),
     parameters: tuple[str, ...] | None = None,
     inputs: tuple[str, ...] | None = None,
+    outputs: tuple[str, ...] | None = None,
     platforms: tuple[str, ...] | None = None,
     t1: float = 20.0,
     dt: float = 0.05,
@@ -41,6 +42,8 @@ def export(
         parameters: numbers of the scene that can be set before a run, such as body.link1.mass or pin.A; by default none in C, and
             all in an FMU.
         inputs: numbers of the scene that can be set during a run of an FMU; by default those of torques and forces.
+        outputs: outputs of an FMU besides the coordinates of bodies, such as pin.A.x or joint.A.angle; by default positions and
+            velocities of all pins that move.
         platforms: platforms of the FMU, such as x86_64-linux; by default this one. Others need the extra zig.
         t1: end of the program's run, or of the FMU's default experiment (s).
         dt: time between outputs, or the step of the default experiment (s).
@@ -56,7 +59,7 @@ def export(
         if fmu.suffix != ".fmu" or not fmu.parent.is_dir() or fmu.is_dir():
             refuse(f"--fmu {fmu}: give the name of a file that ends in .fmu, in a folder that exists")
         mech, _ = load(scene)
-        _fmu(mech, fmu, (kinds, parameters, inputs, t0, t1, dt, rtol, atol, stiff, platforms), json)
+        _fmu(mech, fmu, (kinds, parameters, inputs, outputs, t0, t1, dt, rtol, atol, stiff, platforms), json)
         return
     assert c is not None
     check_folder(c)

@@ -18,11 +18,15 @@ from tests.command_line import udkjax
 from tests.integrate.portable.test_export_c import DRAWINGS, fused, scene
 from udkjax.integrate.portable.fmi.compilers import SUFFIXES, this_platform
 from udkjax.integrate.portable.fmi.description import base_unit
+from udkjax.integrate.portable.fmi.variables import MeasuredState
+from udkjax.positions.assembling.channel_values import measure
+from udkjax.positions.assembling.channels import channel_of
 
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None or platform.system() != "Linux", reason="no C compiler")
 OK, DISCARD, ERROR = 0, 2, 3
 LOG = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_int, ctypes.c_char_p, ctypes.c_char_p)
 DRIVE = "force.motor.value"
+OUTPUTS = ["body.rod(0.2, 0.1).vx", "joint.pin.angle", "body.rod(0.5, 0.0).y"]
 
 
 def options(level="-O0"):
@@ -105,7 +109,7 @@ class Instance:
 @pytest.fixture(scope="module")
 def fmu(tmp_path_factory):
     folder = tmp_path_factory.mktemp("fmu")
-    return udk.export_fmu(pendulum(), folder / "pendulum.fmu", stiff=False, options=options())
+    return udk.export_fmu(pendulum(), folder / "pendulum.fmu", stiff=False, outputs=OUTPUTS, options=options())
 
 
 @pytest.fixture
@@ -125,6 +129,7 @@ def test_the_description_has_the_scene_s_names_units_and_roles(fmu, instance):
     mass = found["body.rod.mass"]
     assert (mass["causality"], mass["variability"], mass["unit"], mass["start"]) == ("parameter", "fixed", "kg", "2.0")
     assert [found[x]["unit"] for x in ("body.rod.x", "body.rod.omega", "body.rod.alpha")] == ["m", "rad/s", "rad/s2"]
+    assert [found[x]["causality"] for x in OUTPUTS] == ["output"] * 3 and fmu.outputs[-3:] == OUTPUTS
     assert found["der(state.body.rod.omega)"]["derivative"] == found["state.body.rod.omega"]["valueReference"]
     assert not any("position" in name or "velocity" in name for name in fmu.parameters)
     units = {x.get("name"): {**x[0].attrib} for x in xml.iter("Unit")}
@@ -158,6 +163,7 @@ def test_co_simulation_equals_steps_with_parameters_and_inputs(instance):
         same(one.get(*names), np.ravel([state.q, state.v]), **({} if fused() else {"rtol": 1e-11, "atol": 1e-12}))
     wanted = udk.accelerations(mechanism.with_parameters({**values, DRIVE: torque}), 0.4, state.q, state.v)
     assert_allclose(one.get("body.rod.ax", "body.rod.ay", "body.rod.alpha"), wanted[0], rtol=1e-12)
+    assert_allclose(one.get(*OUTPUTS), measured(mechanism, state.q, state.v), rtol=1e-12, atol=1e-14)
 
 
 def test_a_state_is_restored_from_its_bytes(instance):
@@ -174,7 +180,9 @@ def test_a_state_is_restored_from_its_bytes(instance):
     assert one.call("SetFMUState", copy) == OK
     assert [one.step(0.1, 0.1), one.get("time", DRIVE).tolist()] == [ahead[0], [0.2, 0.0]]
     assert_array_equal(one.get(*names), ahead[1])
-    assert one.call("DeserializeFMUState", b"x" * size.value, size, ctypes.byref(copy)) == ERROR
+    head = len(one.token) + 1  # the token, as text of C
+    for damaged in (b"x" * size.value, data.raw[:head] + b"\0" * (size.value - head)):
+        assert one.call("DeserializeFMUState", damaged, size, ctypes.byref(copy)) == ERROR
     for state in (kept, copy):
         assert one.call("FreeFMUState", ctypes.byref(state)) == OK and not state.value
 
@@ -229,8 +237,14 @@ def test_model_exchange_evaluates_the_projected_state_and_lets_drift_decay(insta
     assert_array_equal(one.vector("GetContinuousStates", 6), one.get(*names))
 
 
+def measured(mechanism: udk.Mechanism, q, v):
+    """Return the further outputs at a state."""
+    motion = MeasuredState(jnp.zeros(1), jnp.reshape(q, (1, -1, 3)), jnp.reshape(v, (1, -1, 3)))
+    return measure(mechanism, motion, [channel_of(mechanism, x) for x in OUTPUTS])[0]
+
+
 def closed(mechanism: udk.Mechanism, state):
-    """Return a state near the constraints, projected onto them to first order, and its accelerations; by the textbook."""
+    """Return a state near the constraints, projected onto them to first order, with accelerations and further outputs."""
     (q, v), of = state.reshape(2, -1), udk.equations
     mass = of.mass(mechanism)
 
@@ -240,12 +254,12 @@ def closed(mechanism: udk.Mechanism, state):
 
     q = corrected(q, of.psi(mechanism, 0.0, q), q)
     v = corrected(v, of.psi_dot(mechanism, 0.0, q, v), q)
-    return jnp.concatenate([q, v, jnp.ravel(udk.accelerations(mechanism, 0.0, q, v))])
+    return jnp.concatenate([q, v, jnp.ravel(udk.accelerations(mechanism, 0.0, q, v)), measured(mechanism, q, v)])
 
 
 def test_derivatives_equal_those_of_jax_forward_and_adjoint(instance):
     mechanism, rng, names = pendulum(), np.random.default_rng(0), states(pendulum())
-    knowns, a = [*(f"state.{x}" for x in names), DRIVE], ["body.rod.ax", "body.rod.ay", "body.rod.alpha"]
+    knowns, a = [*(f"state.{x}" for x in names), DRIVE], ["body.rod.ax", "body.rod.ay", "body.rod.alpha", *OUTPUTS]
     rates = [f"der(state.{x})" for x in names]
     one, other = instance("ModelExchange"), instance("CoSimulation")
     for x in (one, other):
@@ -255,7 +269,8 @@ def test_derivatives_equal_those_of_jax_forward_and_adjoint(instance):
         given = {"body.rod.mass": p[0], DRIVE: p[1], "gravity": p[2:4], "body.rod.angle": p[4], "body.rod.angular_velocity": p[5]}
         changed = mechanism.with_parameters(given)
         state = udk.assemble(changed)
-        return jnp.concatenate([jnp.ravel(x) for x in (state.q, state.v, udk.accelerations(changed, 0.0, state.q, state.v))])
+        a = udk.accelerations(changed, 0.0, state.q, state.v)
+        return jnp.concatenate([*map(jnp.ravel, (state.q, state.v, a)), measured(changed, state.q, state.v)])
 
     p, seed = np.array([1.7, 0.0, 0.0, -9.81, 0.3, 2.0]), rng.normal(size=6)
     assert (
@@ -270,17 +285,17 @@ def test_derivatives_equal_those_of_jax_forward_and_adjoint(instance):
     start = one.get(*(f"state.{x}" for x in names))
     values = jax.jit(jax.jacfwd(lambda x: closed(mechanism.with_parameters({"body.rod.mass": 1.7, DRIVE: x[6]}), x[:6])))
     jacobian = np.asarray(values(np.append(start, 0.0)))
-    drift = (one.derivative("Directional", rates, knowns, seed := rng.normal(size=7)) - jacobian[3:] @ seed) / (
+    drift = (one.derivative("Directional", rates, knowns, seed := rng.normal(size=7)) - jacobian[3:9] @ seed) / (
         jacobian[:6] @ seed - seed[:6]
     )
     assert_allclose(drift, drift[0], rtol=1e-9)  # the rate at which it decays
     found = np.transpose([one.derivative("Directional", [*names, *a], knowns, x) for x in np.eye(7)])
     assert_allclose(found, jacobian, rtol=0.0, atol=1e-12 * np.abs(jacobian).max())
     assert_allclose(
-        one.derivative("Adjoint", [*names, *a], knowns, seed := rng.normal(size=9)), seed @ found, rtol=1e-13, atol=1e-12
+        one.derivative("Adjoint", [*names, *a], knowns, seed := rng.normal(size=12)), seed @ found, rtol=1e-13, atol=1e-12
     )
     step = other.derivative("Directional", [*names, *a], [DRIVE], [1.0])  # an input does not move the state at once
-    assert_allclose(step, [0.0] * 6 + [*jacobian[6:, 6]], rtol=0.0, atol=1e-12 * np.abs(jacobian).max())
+    assert_allclose(step, [0.0] * 6 + [*jacobian[6:9, 6]] + [0.0] * 3, rtol=0.0, atol=1e-12 * np.abs(jacobian).max())
     with pytest.raises(AssertionError, match="no derivative with respect to variable 0"):
         one.derivative("Directional", a, ["time"], [1.0])
 
@@ -301,6 +316,8 @@ def test_what_cannot_be_exported_is_refused(tmp_path, capsys):
         ({"t1": -1.0}, "t1 must be later than t0 = 0 s, not -1 s"),
         ({"parameters": [DRIVE], "inputs": [DRIVE]}, f"{DRIVE}: an input is no parameter as well"),
         ({"inputs": ["force.nothing.value"]}, "force.nothing.value"),
+        ({"outputs": ["body.rod.ax"]}, "outputs are positions and velocities of what moves: leave out body.rod.ax"),
+        ({"outputs": ["pin.nothing.x"]}, "nothing"),
         ({"options": ["-no-such-option"]}, "cc.* failed for .*no-such-option"),
     ]
     for given, message in refused:

@@ -78,7 +78,7 @@ class NumberProgram:
         self.base = np.concatenate(known)
         self.count, self.knots = (len(x) for x in known[:2])
         self._numbers, self._parameters = numbers, len(values)
-        self._program, self.changing = _traced(numbers, len(values))
+        self._program, self.changing = traced_program(numbers, len(values))
 
     def function(self) -> Function:
         """Return `numbers(parameters, numbers)`, which writes the numbers that depend on parameters."""
@@ -90,7 +90,7 @@ class NumberProgram:
         def along(x: Array) -> Array:
             return jax.jvp(self._numbers, (x[: self._parameters],), (x[self._parameters :],))[1]
 
-        program, changing = _traced(along, 2 * self._parameters)
+        program, changing = traced_program(along, 2 * self._parameters)
         return vector_function(program, "numbers_along", "parameters", "numbers", changing)
 
     def __call__(self, values: Sequence[float]) -> Float[np.ndarray, "numbers"]:
@@ -100,7 +100,7 @@ class NumberProgram:
         return numbers
 
 
-def _traced(function: Callable[[Array], Array], count: int) -> tuple[ScalarProgram, list[int]]:
+def traced_program(function: Callable[[Array], Array], count: int) -> tuple[ScalarProgram, list[int]]:
     """Return a function of `count` numbers as a program of its outputs that depend on these, and the indices of the outputs."""
     graph = Graph(np.float64)
     inputs, outputs = [graph.input(k, "parameter") for k in range(count)], list[Scalar]()

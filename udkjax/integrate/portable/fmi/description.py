@@ -35,7 +35,9 @@ def model_description(
     interfaces = [_tag(KINDS[kind][0], {"modelIdentifier": prefix} | KINDS[kind][1] | able) for kind in kinds]
     start, stop, step = times
     experiment = {"startTime": start, "stopTime": stop, "tolerance": rtol, "stepSize": step}
-    units = sorted({x.unit for x in (*variables.coordinates, *variables.rates, *variables.values)} - {""} | {"s"})
+    units = sorted(
+        {x.unit for x in (*variables.coordinates, *variables.rates, *variables.values, *variables.measures)} - {""} | {"s"}
+    )
     about = {
         "fmiVersion": "3.0",
         "modelName": name,
@@ -103,6 +105,8 @@ def _variables(variables: FMUVariables, exchange: bool) -> Iterable[str]:
         yield _variable(1 + 7 * n + k, x, causality="parameter", variability="fixed", initial="exact")
     for k, x in enumerate(variables.inputs):
         yield _variable(1 + 7 * n + len(variables.parameters) + k, x, causality="input", variability="continuous")
+    for k, x in enumerate(variables.measures, 1 + 7 * n + len(variables.values)):
+        yield _variable(k, x, causality="output", variability="continuous", initial="calculated")
 
 
 def _variable(reference: int, x: FMUVariable, **kinds: str) -> str:
@@ -114,7 +118,8 @@ def _variable(reference: int, x: FMUVariable, **kinds: str) -> str:
 
 def _structure(variables: FMUVariables, exchange: bool) -> Iterable[str]:
     n = len(variables.states) // 2
-    outputs = range(1, 1 + (3 if exchange else 2) * n)
+    first = 1 + 7 * n + len(variables.values)
+    outputs = *range(1, 1 + (3 if exchange else 2) * n), *range(first, first + len(variables.measures))
     states, rates = range(1 + 3 * n, 1 + 5 * n), range(1 + 5 * n, 1 + 7 * n) if exchange else ()
     for name, found in (("Output", outputs), ("ContinuousStateDerivative", rates)):
         yield from (_tag(name, {"valueReference": str(k)}) for k in found)

@@ -18,6 +18,7 @@ from udkjax.integrate.portable.fmi.compilers import SUFFIXES, Platform, compile_
 from udkjax.integrate.portable.fmi.description import KINDS, build_description, model_description
 from udkjax.integrate.portable.fmi.variables import FMUVariables, least_of
 from udkjax.integrate.portable.parameters import guess_of, places_of_numbers
+from udkjax.native.c import c_function
 from udkjax.requirements import ArgumentError
 from udkjax.scene.arguments import checked
 from udkjax.scene.mechanism import Mechanism
@@ -62,6 +63,7 @@ def export_fmu(
     kinds: Sequence[Kind] = ("co-simulation", "model-exchange"),
     parameters: Sequence[str] | None = None,
     inputs: Sequence[str] | None = None,
+    outputs: Sequence[str] | None = None,
     t0: float = 0.0,
     t1: float = 20.0,
     dt: Annotated[float, POSITIVE] = 0.05,
@@ -84,6 +86,8 @@ def export_fmu(
         parameters: names of numbers that can be set before a run, as in `with_parameters`; None: all numbers of the scene. Poses
             are set by the start values of states.
         inputs: names of numbers that can be set during a run; None: those of `Torque` and `Force` elements.
+        outputs: names of outputs besides the coordinates of bodies, such as "pin.A.x" or "joint.A.angle"; None: positions and
+            velocities of all pins that move.
         t0: start of the default experiment (s).
         t1: its end (s).
         dt: its step (s).
@@ -110,8 +114,12 @@ def export_fmu(
     commands = {name: compiler_for(name) for name in to}
     scene = SceneCode(mechanism, np.array([t0, t1], float), rtol, atol, stiff)
     what = ["run", *_further(scene, chosen)]
-    variables = FMUVariables(scene, parameters, inputs)
+    variables = FMUVariables(scene, parameters, inputs, outputs)
     texts, units = scene_files(scene, what, [x.name for x in variables.values])
+    if variables.measures:
+        head = f"void {scene.prefix}_measure(const double *at, double *found)"
+        body = "{\n    measure((double *)(uintptr_t)at, found);\n}\n"
+        texts[f"{scene.prefix}_measure.c"] = f"{c_function(variables.measure())}\n{head};\n{head}\n{body}"
     model = _model(scene, variables, what, max(unit.memory for unit in units.values()), chosen)
     texts |= {name: (SOURCES / name).read_text(encoding="ascii") for name in ("fmi3.h", "fmu.c")}
     token = hashlib.sha256(json.dumps([texts, model], sort_keys=True).encode()).hexdigest()
@@ -120,7 +128,7 @@ def export_fmu(
     description = model_description(mechanism.name or "mechanism", scene.prefix, token, chosen, variables, times, rtol)
     _write(Path(file), scene.prefix, texts, description, commands, options)
     shown = variables.coordinates if "model-exchange" in chosen else variables.coordinates[: 2 * scene.n]
-    names = [[x.name for x in found] for found in (shown, variables.parameters, variables.inputs)]
+    names = [[x.name for x in found] for found in ([*shown, *variables.measures], variables.parameters, variables.inputs)]
     return ExportedFMU(Path(file), list(chosen), to, *names)
 
 
@@ -143,6 +151,8 @@ def _model(scene: SceneCode, variables: FMUVariables, what: Sequence[str], memor
     lines += [f"#define scene_{x} {p}_{x}" for x in ("numbers", "q0", "v0", "set_parameters", "result_name", "step")]
     if "model-exchange" in kinds:
         lines += ["#define MODEL_EXCHANGE", f"#define SCENE_SET_ALONG {p}_set_parameters_along"]
+    if variables.measures:
+        lines += [f"void {p}_measure(const double *at, double *found);", f"#define SCENE_MEASURE {p}_measure"]
     breaks, scales = scene.inputs["breaks"], scene.analysis.scales
     length, rate = float(np.ravel(scales.length)[0]), float(np.ravel(scales.rate)[0])
     size = np.tile([length, length, 1.0], scene.n // 3)
@@ -160,6 +170,7 @@ def _model(scene: SceneCode, variables: FMUVariables, what: Sequence[str], memor
 #define NUMBERS {big}_NUMBERS
 #define VALUES {len(values)} /* parameters, then inputs */
 #define INPUTS {len(variables.inputs)}
+#define MEASURES {len(variables.measures)}
 #define BREAKS {len(breaks)}
 #define MEMORY {memory}
 #define CLOSED {CLOSURE.tol!r} /* largest violation of constraints, over the scales of their rows, that counts as closed */

@@ -1,14 +1,22 @@
 """The variables of an FMU: names, units and places, in the order of their value references in sources/fmu.c."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from udkjax.integrate.portable.c.scene import SceneCode
-from udkjax.integrate.portable.parameters import NumberProgram, scalar_parameters
+from udkjax.integrate.portable.parameters import NumberProgram, scalar_parameters, traced_program
+from udkjax.native.language.ir import Function
+from udkjax.native.language.program import vector_function
+from udkjax.positions.assembling.channel_values import measure
+from udkjax.positions.assembling.channels import Channel, channel_of, pins_of, point_of_pin
 from udkjax.requirements import ArgumentError
+from udkjax.scene.elements.bodies import GROUND
 from udkjax.scene.elements.forces import Force, Torque
 from udkjax.scene.elements.held import Held
 from udkjax.scene.mechanism import Mechanism
@@ -29,6 +37,14 @@ class FMUVariable(NamedTuple):
     start: float | None = None
 
 
+class MeasuredState(NamedTuple):
+    """A motion of one state."""
+
+    ts: Array
+    q: Array
+    v: Array
+
+
 class FMUVariables:
     """The variables of an FMU of a scene.
 
@@ -38,9 +54,16 @@ class FMUVariables:
         rates: the derivatives of the states.
         parameters: numbers that can be set before a run.
         inputs: numbers that can be set during a run.
+        measures: further outputs.
     """
 
-    def __init__(self, scene: SceneCode, parameters: Sequence[str] | None, inputs: Sequence[str] | None):
+    def __init__(
+        self,
+        scene: SceneCode,
+        parameters: Sequence[str] | None,
+        inputs: Sequence[str] | None,
+        outputs: Sequence[str] | None,
+    ):
         bodies, given = scene.mechanism.body_names, scene.mechanism
         self.coordinates = [
             FMUVariable(f"body.{body}.{name}", unit)
@@ -62,11 +85,40 @@ class FMUVariables:
         self.inputs = [FMUVariable(name, _unit(given, name), value) for name, value in chosen.items()]
         kept = {name: value for name, value in values.items() if name not in chosen}
         self.parameters = [FMUVariable(name, _unit(given, name), value) for name, value in kept.items()]
+        self._mechanism, self._channels = given, _channels(given, outputs, {x.name for x in self.coordinates})
+        self.measures = [FMUVariable(channel.name, channel.units) for channel in self._channels]
 
     @property
     def values(self) -> list[FMUVariable]:
         """The parameters and the inputs."""
         return [*self.parameters, *self.inputs]
+
+    def measure(self) -> Function:
+        """Return `measure(at, found)`: the measures, then their changes, of values, q and v, then the changes of these."""
+        names, n = [x.name for x in self.values], len(self.states)
+        length = len(names) + n
+
+        def of(x: Array) -> Array:
+            given = self._mechanism.with_parameters({name: x[k] for k, name in enumerate(names)})
+            q, v = x[len(names) :].reshape(2, 1, -1, 3)
+            return measure(given, MeasuredState(jnp.zeros(1), q, v), self._channels)[0]
+
+        def both(x: Array) -> Array:
+            return jnp.concatenate(jax.jvp(of, (x[:length],), (x[length:],)))
+
+        program, places = traced_program(both, 2 * length)
+        return vector_function(program, "measure", "at", "found", places)
+
+
+def _channels(mechanism: Mechanism, names: Sequence[str] | None, known: Collection[str]) -> list[Channel]:
+    """Return the channels of further outputs; None: positions and velocities of all pins that move."""
+    if names is None:
+        pins = [name for name in pins_of(mechanism) if point_of_pin(mechanism, name)[0] != GROUND]
+        names = [f"pin.{name}.{x}" for name in pins for x in ("x", "y", "vx", "vy")]
+    found = {x.name: x for x in (channel_of(mechanism, name) for name in names)}
+    if wrong := [name for name, x in found.items() if x.needs != "states" or {*x.bodies} == {GROUND}]:
+        raise ArgumentError(f"outputs are positions and velocities of what moves: leave out {', '.join(wrong)}")
+    return [x for name, x in found.items() if name not in known]
 
 
 def least_of(mechanism: Mechanism, name: str) -> str:

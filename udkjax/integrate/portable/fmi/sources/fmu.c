@@ -1,8 +1,8 @@
 /* FMI 3.0 of a scene, for co-simulation and model exchange, by the functions of the scene in C.
 
    Value references: 0 is the time; then, with N coordinates, positions q, velocities v and accelerations from FIRST_Q, FIRST_V and
-   FIRST_A; the integrated state from FIRST_STATE and its derivatives from FIRST_RATE; the parameters, and last the inputs, from
-   FIRST_VALUE. In model exchange the integrated state drifts from the constraints by the importer's errors. The FMU evaluates
+   FIRST_A; the integrated state from FIRST_STATE and its derivatives from FIRST_RATE; the parameters, then the inputs, from
+   FIRST_VALUE; and further outputs from FIRST_MEASURE. In model exchange the integrated state drifts from the constraints by the importer's errors. The FMU evaluates
    the equations at its projection, so that drift does not act on the motion, and q and v are always closed. */
 
 #include <math.h>
@@ -16,7 +16,7 @@
 enum { INSTANTIATED = 1, INITIALIZATION = 2, EVENT = 4, CONTINUOUS = 8, STEP = 16, TERMINATED = 32, ANY = 63 };
 enum { BEFORE = INSTANTIATED | INITIALIZATION };
 enum { FIRST_Q = 1, FIRST_V = FIRST_Q + N, FIRST_A = FIRST_V + N, FIRST_STATE = FIRST_A + N, FIRST_RATE = FIRST_STATE + 2 * N,
-    FIRST_VALUE = FIRST_RATE + 2 * N, END = FIRST_VALUE + VALUES };
+    FIRST_VALUE = FIRST_RATE + 2 * N, FIRST_MEASURE = FIRST_VALUE + VALUES, END = FIRST_MEASURE + MEASURES };
 
 #define SAME_TIME 1e-9 /* of a communication point, relative: nearer ones are the same up to rounding */
 #define DRIFT 1e-6 /* of the state, over its nominal values, beyond which it returns to the constraints in an event */
@@ -31,8 +31,8 @@ typedef struct {
 
 typedef struct {
     State now;
-    double closed[2 * N], a[N], stop;
-    int has_closed, has_a, is_model_exchange;
+    double closed[2 * N], a[N], measured[2 * MEASURES + 1], stop;
+    int has_closed, has_a, has_measured, is_model_exchange;
     double *memory;
     fmi3InstanceEnvironment environment;
     fmi3LogMessageCallback log;
@@ -71,7 +71,7 @@ static fmi3Status check_mode(const Instance *m, int allowed, const char *functio
 #define REFUSED(name, allowed, text) \
     FMI fmi3Status name(fmi3Instance instance) { REQUIRE(allowed); return report(m, fmi3Error, "%s: " text, __func__); }
 
-static void forget(Instance *m) { m->has_closed = m->has_a = 0; }
+static void forget(Instance *m) { m->has_closed = m->has_a = m->has_measured = 0; }
 
 /* --- the scene */
 
@@ -133,6 +133,23 @@ static fmi3Status find_accelerations(Instance *m)
     return report(m, fmi3Error, "the FMU has no accelerations");
 #endif
     m->has_a = 1;
+    return fmi3OK;
+}
+
+/* Find the measures, and their changes along changes d of the closed state and of values, at their value references. */
+static fmi3Status find_measures(Instance *m, const double *d)
+{
+    const fmi3Status status = find_closed(m);
+    if (status || (m->has_measured && !d)) return status;
+#ifdef SCENE_MEASURE
+    double at[2 * (VALUES + 2 * N)] = {0};
+    memcpy(at, m->now.values, VALUES * sizeof *at);
+    memcpy(at + VALUES, m->closed, sizeof m->closed);
+    if (d) memcpy(at + VALUES + 2 * N, d + FIRST_VALUE, VALUES * sizeof *at);
+    if (d) memcpy(at + 2 * VALUES + 2 * N, d + FIRST_Q, sizeof m->closed);
+    SCENE_MEASURE(at, m->measured);
+#endif
+    m->has_measured = 1;
     return fmi3OK;
 }
 
@@ -271,11 +288,12 @@ FMI fmi3Status fmi3GetFloat64(fmi3Instance instance, const fmi3ValueReference re
         fmi3Status status = fmi3OK;
         if (k >= END) return report(m, fmi3Error, "fmi3GetFloat64: there is no variable %u", (unsigned)k);
         if ((k >= FIRST_A && k < FIRST_STATE) || (k >= FIRST_RATE && k < FIRST_VALUE)) status = find_accelerations(m);
+        else if (k >= FIRST_MEASURE) status = find_measures(m, NULL);
         else if (k != 0 && k < FIRST_VALUE) status = find_closed(m);
         if (status) return status;
         values[i] = k == 0 ? m->now.t : k < FIRST_A ? m->closed[k - FIRST_Q] : k < FIRST_STATE ? m->a[k - FIRST_A]
             : k < FIRST_RATE ? m->now.state[k - FIRST_STATE] : k < FIRST_VALUE ? rate_of(m, k - FIRST_RATE)
-            : m->now.values[k - FIRST_VALUE];
+            : k < FIRST_MEASURE ? m->now.values[k - FIRST_VALUE] : m->measured[k - FIRST_MEASURE];
     }
     return fmi3OK;
 }
@@ -287,7 +305,7 @@ FMI fmi3Status fmi3SetFloat64(fmi3Instance instance, const fmi3ValueReference re
     if (n != count) return report(m, fmi3Error, "fmi3SetFloat64: %u values of %u variables", (unsigned)count, (unsigned)n);
     for (size_t i = 0; i < n; i++) { /* nothing changes unless all are right */
         const fmi3ValueReference k = references[i];
-        const int is_state = k >= FIRST_STATE && k < FIRST_RATE, is_value = k >= FIRST_VALUE && k < END;
+        const int is_state = k >= FIRST_STATE && k < FIRST_RATE, is_value = k >= FIRST_VALUE && k < FIRST_MEASURE;
         if (!is_state && !is_value) return report(m, fmi3Error, "fmi3SetFloat64: variable %u cannot be set", (unsigned)k);
         if (!isfinite(values[i])) return report(m, fmi3Error, "%s must be finite, not %g", name_of(k), values[i]);
         if (is_value && (least[k - FIRST_VALUE] == POSITIVE ? values[i] <= 0 : least[k - FIRST_VALUE] && values[i] < 0))
@@ -560,6 +578,8 @@ static fmi3Status push(Instance *m, double *d)
     if (s->mode & BEFORE) memcpy(change, d + FIRST_Q, sizeof changes);
     SCENE_ACCELERATIONS_ALONG(s->numbers, s->t, m->closed, m->closed + N, numbers, d + FIRST_Q, d + FIRST_V, guessed, d + FIRST_A,
         m->memory);
+    find_measures(m, d);
+    for (int k = 0; k < MEASURES; k++) d[FIRST_MEASURE + k] = m->measured[MEASURES + k];
     for (int k = 0; k < 2 * N; k++) d[FIRST_RATE + k] = d[FIRST_V + k] + DECAY * (d[FIRST_Q + k] - change[k]);
     return fmi3OK;
 }
@@ -568,10 +588,10 @@ static fmi3Status check_variables(const Instance *m, const fmi3ValueReference un
     const fmi3ValueReference knowns[], size_t n_knowns)
 {
     for (size_t i = 0; i < n_unknowns; i++)
-        if (unknowns[i] == 0 || unknowns[i] >= FIRST_VALUE)
+        if (unknowns[i] == 0 || (unknowns[i] >= FIRST_VALUE && unknowns[i] < FIRST_MEASURE) || unknowns[i] >= END)
             return report(m, fmi3Error, "there is no derivative of variable %u", (unsigned)unknowns[i]);
     for (size_t i = 0; i < n_knowns; i++)
-        if (knowns[i] < FIRST_STATE || (knowns[i] >= FIRST_RATE && knowns[i] < FIRST_VALUE) || knowns[i] >= END)
+        if (knowns[i] < FIRST_STATE || (knowns[i] >= FIRST_RATE && knowns[i] < FIRST_VALUE) || knowns[i] >= FIRST_MEASURE)
             return report(m, fmi3Error, "there is no derivative with respect to variable %u", (unsigned)knowns[i]);
     return fmi3OK;
 }
