@@ -36,6 +36,7 @@ def test_a_fresh_process_computes_the_same_bits(tmp_path):
         np.save(tmp_path / f"{name}.x.npy", x)
         np.save(tmp_path / f"{name}.npy", y)
     said = python(f"folder = {str(tmp_path)!r}\n{LOAD}", UDKJAX_CACHE=tmp_path / "cache", HOME=tmp_path)
+    print(said)  # shown by pytest -s
     assert said.split() == ["run", "True", "gradient", "True", "batch", "True"]
 
 

@@ -223,8 +223,10 @@ def test_every_scene_has_reactions_and_derivatives_in_c(name, tmp_path):
         memory = numbers(np.full(code.memory[what] // 8, np.nan))
         return getattr(library, f"{code.prefix}_{name}")(given, t, *arguments, memory)
 
-    def close_to(found, wanted):
-        assert_allclose(found, wanted, rtol=0.0, atol=1e-12 * np.abs([changes, wanted]).max())
+    def close_to(found, wanted, what, of):
+        difference = np.abs(found - np.asarray(wanted)).max(initial=0.0) / np.abs(of).max()
+        print(f"{Path(name).stem}, {what}: relative difference {difference:.1e}")  # shown by pytest -s
+        assert difference < 1e-12
 
     def of(function):
         def states(q, v):
@@ -235,22 +237,21 @@ def test_every_scene_has_reactions_and_derivatives_in_c(name, tmp_path):
 
     closed = np.zeros((2, len(q)))
     call("close_along", "position_derivatives", *map(numbers, (q, v, zeros, *changes, closed)))
-    close_to(closed, jax.jvp(of(lambda x: udk.assemble(mechanism, run.ts[1], x)), (q, v), tuple(changes))[1])
+    wanted = jax.jvp(of(lambda x: udk.assemble(mechanism, run.ts[1], x)), (q, v), tuple(changes))[1]
+    close_to(closed, wanted, "derivatives of closed positions", [changes, wanted])
     along = closed + [v, np.ravel(udk.accelerations(mechanism, run.ts[1], q, v))]  # drivers allow their motion only
     found = derivative_in_c(library, code, given, zeros, q, v, *along, t=run.ts[1])
     wanted = jax.jvp(lambda q, v: jax.numpy.ravel(udk.accelerations(mechanism, run.ts[1], q, v)), (q, v), tuple(along))
-    for x, y in zip(found, wanted, strict=True):
-        assert_allclose(x, y, rtol=0.0, atol=1e-12 * np.abs(wanted).max())
+    close_to(found, wanted, "accelerations and their derivatives", wanted)
     state, moved = np.stack([q, v]), along.copy()
     arguments = [ctypes.c_double(dt), *map(numbers, (*state, zeros, *moved))]
     assert call("step_along", "step_derivatives", *arguments) == 0
     wanted = jax.jvp(of(lambda x: udk.step(mechanism, x, None, dt, run.ts[1], analysis=analysis)), (q, v), tuple(along))
-    close_to(moved, wanted[1])
+    close_to(moved, wanted[1], "derivatives of a step", [along, wanted[1]])
     reactions = [x[1] for bodies in udk.reactions(mechanism, run).values() for x in bodies.values()]
     efforts = [x[1] for x in udk.efforts(mechanism, run).values()]
     found = [np.zeros(3 * len(reactions)), np.zeros(len(efforts))]
     call("reactions", "reactions", *map(numbers, (q, v, *found)))
-    for x, y in zip(found, (reactions, efforts), strict=True):
-        assert_allclose(x, np.ravel(y), rtol=0.0, atol=1e-12 * np.abs(reactions).max())
+    close_to(np.concatenate(found), np.concatenate([np.ravel(reactions), efforts]), "reactions and efforts", reactions)
     undefined = subprocess.run(["nm", "-u", "code.so"], cwd=tmp_path, check=True, capture_output=True, text=True).stdout.split()
     assert {x.partition("@")[0] for x in undefined if "@GLIBC" in x and not x.startswith("__")} <= OF_C

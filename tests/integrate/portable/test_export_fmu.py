@@ -372,5 +372,7 @@ def test_model_exchange_stays_closed_through_singular_poses(tmp_path):
         table = fmpy.simulate_fmu(str(found.file), fmi_type="ModelExchange", relative_tolerance=tolerance, **given)
         link, x, coupler = (np.array([row[name] for row in table]) for name in names)
         errors.append(np.abs(link - angle).max())
-        assert np.abs(np.cos(link) - (x - np.cos(coupler))).max() < 1e-12  # m, at the pin B1
+        gap = np.abs(np.cos(link) - (x - np.cos(coupler))).max()  # m, at the pin B1
+        print(f"CVODE at {tolerance:g}, 20 s: error {errors[-1]:.1e} rad, gap {gap:.1e} m")  # shown by pytest -s
+        assert gap < 1e-12
     assert errors[0] < 1e-3 and errors[1] < 1e-5  # rad; CVODE's errors with the pendulum equation of this motion are half of it

@@ -13,6 +13,8 @@
 #include "fmi3.h"
 #include "model.h"
 
+#pragma GCC diagnostic ignored "-Wunused-parameter" /* FMI prescribes parameters that this FMU does not need */
+
 enum { INSTANTIATED = 1, INITIALIZATION = 2, EVENT = 4, CONTINUOUS = 8, STEP = 16, TERMINATED = 32, ANY = 63 };
 enum { BEFORE = INSTANTIATED | INITIALIZATION };
 enum { FIRST_Q = 1, FIRST_V = FIRST_Q + N, FIRST_A = FIRST_V + N, FIRST_STATE = FIRST_A + N, FIRST_RATE = FIRST_STATE + 2 * N,
@@ -166,7 +168,6 @@ FMI const char *fmi3GetVersion(void) { return "3.0"; }
 FMI fmi3Status fmi3SetDebugLogging(fmi3Instance instance, fmi3Boolean on, size_t n, const fmi3String categories[])
 {
     REQUIRE(ANY);
-    (void)on, (void)n, (void)categories;
     return fmi3OK;
 }
 
@@ -208,31 +209,28 @@ static Instance *instantiate(const char *token, fmi3InstanceEnvironment environm
     return m;
 }
 
-FMI fmi3Instance fmi3InstantiateCoSimulation(fmi3String name, fmi3String token, fmi3String resources, fmi3Boolean visible,
-    fmi3Boolean logging, fmi3Boolean events, fmi3Boolean early, const fmi3ValueReference required[], size_t n,
-    fmi3InstanceEnvironment environment, fmi3LogMessageCallback log, fmi3IntermediateUpdateCallback update)
+#define IDENTITY \
+    fmi3String name, fmi3String token, fmi3String resources, fmi3Boolean visible, fmi3Boolean logging
+#define ENVIRONMENT fmi3InstanceEnvironment environment, fmi3LogMessageCallback log
+
+FMI fmi3Instance fmi3InstantiateCoSimulation(IDENTITY, fmi3Boolean events, fmi3Boolean early,
+    const fmi3ValueReference required[], size_t n, ENVIRONMENT, fmi3IntermediateUpdateCallback update)
 {
-    (void)name, (void)resources, (void)visible, (void)logging, (void)events, (void)early, (void)required, (void)n, (void)update;
     return instantiate(token, environment, log, 0);
 }
 
-FMI fmi3Instance fmi3InstantiateModelExchange(fmi3String name, fmi3String token, fmi3String resources, fmi3Boolean visible,
-    fmi3Boolean logging, fmi3InstanceEnvironment environment, fmi3LogMessageCallback log)
+FMI fmi3Instance fmi3InstantiateModelExchange(IDENTITY, ENVIRONMENT)
 {
-    (void)name, (void)resources, (void)visible, (void)logging;
 #ifndef MODEL_EXCHANGE
-    (void)token;
     return refuse(environment, log, "this FMU is for co-simulation only");
 #else
     return instantiate(token, environment, log, 1);
 #endif
 }
 
-FMI fmi3Instance fmi3InstantiateScheduledExecution(fmi3String name, fmi3String token, fmi3String resources, fmi3Boolean visible,
-    fmi3Boolean logging, fmi3InstanceEnvironment environment, fmi3LogMessageCallback log, fmi3ClockUpdateCallback update,
+FMI fmi3Instance fmi3InstantiateScheduledExecution(IDENTITY, ENVIRONMENT, fmi3ClockUpdateCallback update,
     fmi3LockPreemptionCallback lock, fmi3UnlockPreemptionCallback unlock)
 {
-    (void)name, (void)token, (void)resources, (void)visible, (void)logging, (void)update, (void)lock, (void)unlock;
     return refuse(environment, log, "this FMU has no scheduled execution");
 }
 
@@ -248,7 +246,6 @@ FMI fmi3Status fmi3EnterInitializationMode(fmi3Instance instance, fmi3Boolean ha
     fmi3Float64 start, fmi3Boolean has_stop, fmi3Float64 stop)
 {
     REQUIRE(INSTANTIATED);
-    (void)has_tolerance, (void)tolerance;
     if (!isfinite(start) || (has_stop && !(stop > start)))
         return report(m, fmi3Error, "the times of a run must be finite and increase, not from %g to %g s", start, stop);
     m->now.open |= start != m->now.t;
@@ -331,7 +328,6 @@ FMI fmi3Status fmi3SetFloat64(fmi3Instance instance, const fmi3ValueReference re
     FMI fmi3Status access(fmi3Instance instance, const fmi3ValueReference references[], size_t n, T values[], size_t count) \
     { \
         REQUIRE(ANY); \
-        (void)references, (void)values; \
         return n || count ? report(m, fmi3Error, "the FMU has no variables of type " #type) : fmi3OK; \
     }
 #define NO_VARIABLES(type, T) NO_VARIABLES_OF(fmi3Get##type, type, T) NO_VARIABLES_OF(fmi3Set##type, type, const T)
@@ -381,7 +377,6 @@ FMI fmi3Status fmi3SetFMUState(fmi3Instance instance, fmi3FMUState state)
 
 FMI fmi3Status fmi3FreeFMUState(fmi3Instance instance, fmi3FMUState *state)
 {
-    (void)instance;
     if (state) {
         free(*state);
         *state = NULL;
@@ -395,7 +390,6 @@ FMI fmi3Status fmi3FreeFMUState(fmi3Instance instance, fmi3FMUState *state)
 FMI fmi3Status fmi3SerializedFMUStateSize(fmi3Instance instance, fmi3FMUState state, size_t *size)
 {
     REQUIRE(ANY);
-    (void)state;
     *size = SERIALIZED;
     return fmi3OK;
 }
@@ -428,7 +422,6 @@ FMI fmi3Status fmi3DoStep(fmi3Instance instance, fmi3Float64 t, fmi3Float64 dt, 
 {
     REQUIRE(STEP);
     int result;
-    (void)no_set_state;
     *event = *terminate = *early = false;
     *reached = m->now.t;
     if (!(dt > 0) || !isfinite(dt)) return report(m, fmi3Error, "a step must be finite and > 0 s, not %g", dt);
@@ -486,7 +479,6 @@ FMI fmi3Status fmi3CompletedIntegratorStep(fmi3Instance instance, fmi3Boolean no
 {
     REQUIRE(CONTINUOUS);
     const fmi3Status status = find_closed(m);
-    (void)no_set_state;
     *terminate = false;
     *event = !status && has_drifted(m);
     return status;
@@ -546,7 +538,6 @@ FMI fmi3Status fmi3GetNominalsOfContinuousStates(fmi3Instance instance, fmi3Floa
 FMI fmi3Status fmi3GetEventIndicators(fmi3Instance instance, fmi3Float64 values[], size_t n)
 {
     REQUIRE(ANY);
-    (void)values;
     return n ? report(m, fmi3Error, "the FMU has no event indicators") : fmi3OK;
 }
 
@@ -633,8 +624,6 @@ REFUSED(fmi3EnterConfigurationMode, ANY, "the FMU has no structural parameters")
 REFUSED(fmi3ExitConfigurationMode, ANY, "the FMU has no structural parameters")
 
 #define REFERENCES const fmi3ValueReference references[], size_t n
-#pragma GCC diagnostic push
-#pragma GCC diagnostic ignored "-Wunused-parameter"
 UNSUPPORTED(fmi3GetBinary, REFERENCES, size_t sizes[], fmi3Binary values[], size_t count)
 UNSUPPORTED(fmi3SetBinary, REFERENCES, const size_t sizes[], const fmi3Binary values[], size_t count)
 UNSUPPORTED(fmi3GetClock, REFERENCES, fmi3Clock values[])
@@ -658,4 +647,3 @@ UNSUPPORTED(fmi3SetIntervalFraction, REFERENCES, const fmi3UInt64 counters[], co
 UNSUPPORTED(fmi3SetShiftDecimal, REFERENCES, const fmi3Float64 shifts[])
 UNSUPPORTED(fmi3SetShiftFraction, REFERENCES, const fmi3UInt64 counters[], const fmi3UInt64 resolutions[])
 UNSUPPORTED(fmi3ActivateModelPartition, fmi3ValueReference clock, fmi3Float64 time)
-#pragma GCC diagnostic pop
