@@ -31,6 +31,7 @@ gpu = pytest.importorskip("benchmarks.gpu")
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="JAX has no CUDA there")
 
 LINKAGE, FOUR_BAR, PENDULUM = udk.library.parallelogram(), udk.library.four_bar(), udk.library.compound_pendulum()
+START, KNOWN = udk.assemble(LINKAGE), udk.analyse(LINKAGE)
 MASSES = np.linspace(1.0, 2.0, 5)
 BOUNCER = udk.Mechanism({"ball": udk.Body(1.0, 0.1, position=(0.0, 1.0))})
 FLOOR = udk.Contact("ball", restitution=0.8, name="floor")
@@ -76,6 +77,7 @@ RUNS = {
     "gradient of a closed one": with_gradient(last(FOUR_BAR, "pin.B[0]", 3)),
     "gradient by Baumgarte": with_gradient(last(LINKAGE, "body.coupler.mass", stabilization=udk.Baumgarte())),
     "second tangent": with_second(last(PENDULUM, "body.rod.mass", 3)),
+    "control step": lambda x: udk.step(LINKAGE, START, {"body.coupler.mass": x}, 0.05, analysis=KNOWN).q,
 }
 
 
