@@ -40,6 +40,7 @@ from udkjax.positions.assembling.channels import Channel as Channel
 from udkjax.positions.assembling.channels import Quantity as Quantity
 from udkjax.positions.assembling.channels import StateHistory as StateHistory
 from udkjax.positions.assembling.channels import channel_of as channel_of
+from udkjax.positions.assembling.channels import channels_of as channels_of
 from udkjax.positions.assembling.channels import has_point as has_point
 from udkjax.positions.assembling.channels import locate as locate
 from udkjax.positions.assembling.coordinates import Coordinate as Coordinate

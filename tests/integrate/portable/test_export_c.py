@@ -8,6 +8,7 @@ import re
 import shutil
 import subprocess
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -50,6 +51,11 @@ def flat(*xs):
     return [np.array(x, float).ravel() for x in xs]
 
 
+def count_of_numbers(code) -> int:
+    header = next(x for x in code.files if x.suffix == ".h").read_text()
+    return int(re.findall(r"_NUMBERS (\d+)", header)[0])
+
+
 def scene_numbers(library, prefix):
     return ctypes.byref(ctypes.c_double.in_dll(library, f"{prefix}_numbers"))
 
@@ -58,7 +64,7 @@ def scene_numbers(library, prefix):
 def pendulum(tmp_path_factory):
     folder = tmp_path_factory.mktemp("pendulum")
     mechanism = udk.library.compound_pendulum()
-    what = ["run", "accelerations", "derivatives", "projection", "positions", "reactions"]
+    what: Any = ["run", "accelerations", "derivatives", "projection", "positions", "reactions"]
     code = udk.export_c(mechanism, folder, what, TS, ["body.rod.mass", "gravity"], stiff=False)
     return mechanism, code, compiled(folder, f"-O0 {fused()}")
 
@@ -106,8 +112,7 @@ def test_derivatives_in_c_equal_those_of_jax(pendulum):
     rng, state = np.random.default_rng(0), udk.assemble(mechanism)
     q, v, dq, dv = *flat(state.q, state.v), *rng.normal(size=(2, 3))
     parameters, changes = np.array([float(mechanism.bodies["rod"].mass), 0.0, -9.81]), rng.normal(size=3)
-    header = next(x for x in code.files if x.suffix == ".h").read_text()
-    dnumbers = np.full(int(re.search(r"_NUMBERS (\d+)", header)[1]), np.nan)
+    dnumbers = np.full(count_of_numbers(code), np.nan)
     getattr(library, f"{code.prefix}_set_parameters_along")(numbers(np.concatenate([parameters, changes])), numbers(dnumbers))
     found = derivative_in_c(library, code, scene_numbers(library, code.prefix), dnumbers, q, v, dq, dv)
 
@@ -121,9 +126,7 @@ def test_derivatives_in_c_equal_those_of_jax(pendulum):
 def test_a_step_with_other_parameters_equals_that_of_the_package(pendulum):
     mechanism, code, library = pendulum
     state, memory = udk.assemble(mechanism), np.full(code.memory["run"] // 8, np.nan)
-    header = next(x for x in code.files if x.suffix == ".h").read_text()
-    count = int(re.search(r"_NUMBERS (\d+)", header)[1])
-    own = np.array((ctypes.c_double * count).in_dll(library, f"{code.prefix}_numbers"))
+    own = np.array((ctypes.c_double * count_of_numbers(code)).in_dll(library, f"{code.prefix}_numbers"))
     for values in ({}, {"body.rod.mass": 1.3, "gravity": np.array([0.5, -9.0])}):
         if values:
             getattr(library, f"{code.prefix}_set_parameters")(
@@ -147,7 +150,7 @@ def test_the_program_prints_the_table_of_the_command(scene, tmp_path, capsys):
     found = subprocess.run(["./run"], cwd=tmp_path / "c", check=True, capture_output=True, text=True).stdout.splitlines()
     assert found[0] == wanted[0]
     pairs = [np.array([[float(x) for x in line.split(",")] for line in lines[1:]]) for lines in (found, wanted)]
-    (assert_array_equal if fused() and processor.lanes() > 1 else assert_allclose)(*pairs, **({} if fused() else {"atol": 1e-9}))
+    assert_allclose(*pairs, rtol=0.0, atol=0.0 if fused() and processor.lanes() > 1 else 1e-9)
     called = subprocess.run(["nm", "-u", "run"], cwd=tmp_path / "c", check=True, capture_output=True, text=True).stdout.split()
     own = {x.partition("@")[0] for x in called if "@GLIBC" in x and not x.startswith("__")}
     assert own <= OF_C | {"puts", "putchar", "printf", "fprintf", "stderr", "fputc", "fputs", "putc", "fwrite"}
@@ -213,11 +216,12 @@ def test_every_scene_runs_in_c(name, tmp_path):
 @pytest.mark.parametrize("name", [*sorted(udk.library.__all__), *DRAWINGS], ids=lambda x: Path(x).stem)
 def test_every_scene_has_reactions_and_derivatives_in_c(name, tmp_path):
     """Changes of the state are projected onto the constraints, which keeps redundant ones compatible."""
-    mechanism, what = scene(name), ["step_derivatives", "derivatives", "position_derivatives", "reactions"]
+    what: Any = ["step_derivatives", "derivatives", "position_derivatives", "reactions"]
+    mechanism = scene(name)
     code, dt = udk.export_c(mechanism, tmp_path, what), 0.003
     library, run, analysis = compiled(tmp_path, fused()), udk.simulate(mechanism, [0.0, dt, 2 * dt]), udk.analyse(mechanism)
     q, v, given = *flat(run.q[1], run.v[1]), scene_numbers(library, code.prefix)
-    changes, t, zeros = np.random.default_rng(0).normal(size=(2, len(q))), ctypes.c_double(run.ts[1]), np.zeros(10_000)
+    changes, t, zeros = np.random.default_rng(0).normal(size=(2, len(q))), ctypes.c_double(float(run.ts[1])), np.zeros(10_000)
 
     def call(name, what, *arguments):
         memory = numbers(np.full(code.memory[what] // 8, np.nan))
@@ -240,7 +244,7 @@ def test_every_scene_has_reactions_and_derivatives_in_c(name, tmp_path):
     wanted = jax.jvp(of(lambda x: udk.assemble(mechanism, run.ts[1], x)), (q, v), tuple(changes))[1]
     close_to(closed, wanted, "derivatives of closed positions", [changes, wanted])
     along = closed + [v, np.ravel(udk.accelerations(mechanism, run.ts[1], q, v))]  # drivers allow their motion only
-    found = derivative_in_c(library, code, given, zeros, q, v, *along, t=run.ts[1])
+    found = derivative_in_c(library, code, given, zeros, q, v, *along, t=float(run.ts[1]))
     wanted = jax.jvp(lambda q, v: jax.numpy.ravel(udk.accelerations(mechanism, run.ts[1], q, v)), (q, v), tuple(along))
     close_to(found, wanted, "accelerations and their derivatives", wanted)
     state, moved = np.stack([q, v]), along.copy()

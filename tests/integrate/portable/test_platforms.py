@@ -6,6 +6,7 @@ import subprocess
 import sys
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -60,7 +61,7 @@ def machine(data: bytes) -> int:
 
 
 def test_fmus_for_three_platforms_are_made_on_one(tmp_path, zig):
-    platforms = ["x86_64-linux", "aarch64-linux", "x86_64-windows"]
+    platforms: Any = ["x86_64-linux", "aarch64-linux", "x86_64-windows"]
     made = udk.export_fmu(pendulum(), tmp_path / "a.fmu", platforms=platforms, stiff=False, options=["-O1"])
     with zipfile.ZipFile(made.file) as archive:
         data = {x.split("/")[1]: archive.read(x) for x in archive.namelist() if x.startswith("binaries/")}

@@ -3,6 +3,7 @@
 import re
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -28,7 +29,7 @@ def pendulum(**forces: udk.ForceElement) -> udk.Mechanism:
     return udk.Mechanism(one.bodies, one.joints, {}, forces, one.gravity, "pendulum")
 
 
-def rubbing(law: str) -> udk.Mechanism:
+def rubbing(law: Any) -> udk.Mechanism:
     joint = next(iter(pendulum().joints))
     return pendulum(rub=udk.Friction(joint, coefficient=0.2, radius=0.01, law=law))
 
@@ -59,12 +60,12 @@ def on_page(mechanism: udk.Mechanism, folder: Path) -> object:
     return None
 
 
-def in_c(*what: str) -> Callable[[udk.Mechanism, Path], object]:
+def in_c(*what: Any) -> Callable[[udk.Mechanism, Path], object]:
     return lambda mechanism, folder: udk.export_c(mechanism, folder / "c", what, TS, stiff=False)
 
 
-def as_fmu(kind: str) -> Callable[[udk.Mechanism, Path], object]:
-    options = {"parameters": [], "inputs": [], "stiff": False, "platforms": []}
+def as_fmu(kind: Any) -> Callable[[udk.Mechanism, Path], object]:
+    options: Any = {"parameters": [], "inputs": [], "stiff": False, "platforms": []}
     return lambda mechanism, folder: udk.export_fmu(mechanism, folder / "a.fmu", [kind], **options)
 
 

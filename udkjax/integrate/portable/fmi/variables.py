@@ -14,7 +14,7 @@ from udkjax.integrate.portable.parameters import NumberProgram, scalar_parameter
 from udkjax.native.language.ir import Function
 from udkjax.native.language.program import vector_function
 from udkjax.positions.assembling.channel_values import measure
-from udkjax.positions.assembling.channels import Channel, channel_of, pins_of, point_of_pin
+from udkjax.positions.assembling.channels import Channel, channel_of, channels_of
 from udkjax.requirements import ArgumentError
 from udkjax.scene.elements.bodies import GROUND
 from udkjax.scene.elements.forces import Force, Torque
@@ -113,11 +113,11 @@ class FMUVariables:
 def _channels(mechanism: Mechanism, names: Sequence[str] | None, known: Collection[str]) -> list[Channel]:
     """Return the channels of further outputs; None: positions and velocities of all pins that move."""
     if names is None:
-        pins = [name for name in pins_of(mechanism) if point_of_pin(mechanism, name)[0] != GROUND]
-        names = [f"pin.{name}.{x}" for name in pins for x in ("x", "y", "vx", "vy")]
+        found = [channel_of(mechanism, name) for name in channels_of(mechanism) if name.startswith("pin.")]
+        return [x for x in found if x.needs == "states" and x.bodies != (GROUND,)]
     found = {x.name: x for x in (channel_of(mechanism, name) for name in names)}
     if wrong := [name for name, x in found.items() if x.needs != "states" or {*x.bodies} == {GROUND}]:
-        raise ArgumentError(f"outputs are positions and velocities of what moves: leave out {', '.join(wrong)}")
+        raise ArgumentError(f"outputs are positions and velocities of moving points: leave out {', '.join(wrong)}")
     return [x for name, x in found.items() if name not in known]
 
 
