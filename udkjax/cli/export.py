@@ -72,11 +72,11 @@ def export(
 
     found = udk.export_c(mech, c, what, ts, parameters or (), rtol, atol, stiff)
     lines = {
-        "functions": ", ".join(f"{found.prefix}_{name}" for name in found.memory),
+        "functions": f"{', '.join(found.memory)}; {found.prefix}.h describes them",
         "memory": ", ".join(f"{name} {size} bytes" for name, size in found.memory.items()),
         "accelerations": f"at most {found.flops} operations on numbers",
         "wrote": ", ".join(file.name for file in found.files),
-        "compile": f"cd {c} && cc -O2 -std=c99 *.c -o run -lm",
+        "compile": f"cd {c} && cc -O2 -std=c99 *.c {'-o run -lm' if 'run' in found.memory else '-c'}",
     }
     show(found._asdict(), table(f"{mech.name or 'mechanism'}, C99", lines), json)
 

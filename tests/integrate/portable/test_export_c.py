@@ -217,7 +217,7 @@ def test_every_scene_runs_in_c(name, tmp_path):
 def test_every_scene_has_reactions_and_derivatives_in_c(name, tmp_path):
     """Changes of the state are projected onto the constraints, which keeps redundant ones compatible."""
     what: Any = ["step_derivatives", "derivatives", "position_derivatives", "reactions"]
-    mechanism = scene(name)
+    mechanism, mass = scene(name), udk.equations.mass(scene(name))
     code, dt = udk.export_c(mechanism, tmp_path, what), 0.003
     library, run, analysis = compiled(tmp_path, fused()), udk.simulate(mechanism, [0.0, dt, 2 * dt]), udk.analyse(mechanism)
     q, v, given = *flat(run.q[1], run.v[1]), scene_numbers(library, code.prefix)
@@ -246,7 +246,9 @@ def test_every_scene_has_reactions_and_derivatives_in_c(name, tmp_path):
     along = closed + [v, np.ravel(udk.accelerations(mechanism, run.ts[1], q, v))]  # drivers allow their motion only
     found = derivative_in_c(library, code, given, zeros, q, v, *along, t=float(run.ts[1]))
     wanted = jax.jvp(lambda q, v: jax.numpy.ravel(udk.accelerations(mechanism, run.ts[1], q, v)), (q, v), tuple(along))
-    close_to(found, wanted, "accelerations and their derivatives", wanted)
+    # Loads on light links that the constraints oppose cancel in their accelerations, and leave their rounding errors.
+    free = jax.jvp(lambda q, v: udk.equations.force(mechanism, run.ts[1], q, v) / mass, (q, v), tuple(along))
+    close_to(found, wanted, "accelerations and their derivatives", [*wanted, *free])
     state, moved = np.stack([q, v]), along.copy()
     arguments = [ctypes.c_double(dt), *map(numbers, (*state, zeros, *moved))]
     assert call("step_along", "step_derivatives", *arguments) == 0

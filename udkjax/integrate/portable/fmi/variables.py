@@ -115,7 +115,10 @@ def _channels(mechanism: Mechanism, names: Sequence[str] | None, known: Collecti
     if names is None:
         found = [channel_of(mechanism, name) for name in channels_of(mechanism) if name.startswith("pin.")]
         return [x for x in found if x.needs == "states" and x.bodies != (GROUND,)]
-    found = {x.name: x for x in (channel_of(mechanism, name) for name in names)}
+    try:
+        found = {x.name: x for x in (channel_of(mechanism, name) for name in names)}
+    except ValueError as error:
+        raise ArgumentError(f"outputs: {error}") from None
     if wrong := [name for name, x in found.items() if x.needs != "states" or {*x.bodies} == {GROUND}]:
         raise ArgumentError(f"outputs are positions and velocities of moving points: leave out {', '.join(wrong)}")
     return [x for name, x in found.items() if name not in known]
