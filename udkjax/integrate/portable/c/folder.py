@@ -165,7 +165,7 @@ def scene_files(scene: SceneCode, what: Sequence[str], parameters: Sequence[str]
     files = {f"{scene.prefix}.h": header, f"{scene.prefix}_numbers.c": _numbers(scene, names)}
     files |= {f"{scene.prefix}_{name}.c": text for name, (text, _) in units.items()}
     if DIFFERENTIATED & {*units}:
-        files[f"{scene.prefix}_along.c"] = f'#include "{scene.prefix}.h"\n{scene.parameters_along(parameters)}'
+        files[f"{scene.prefix}_along.c"] = f'#include "{scene.prefix}.h"\n{scene.parameters(parameters, along=True)[0]}'
     return files, {name: unit for name, (_, unit) in units.items()}
 
 

@@ -28,7 +28,7 @@ from udkjax.native.runs import RunStates
 from udkjax.pinv import SVD
 from udkjax.positions.assembling.assembly import State, assemble
 from udkjax.requirements import ArgumentError
-from udkjax.scene.elements.bodies import COORDINATES, GROUND
+from udkjax.scene.elements.bodies import GROUND
 from udkjax.scene.mechanism import Mechanism
 from udkjax.wording import quote
 
@@ -66,7 +66,6 @@ class SceneCode:
         refuse_what_needs_python(self.mechanism)
         self._choices = choices
         self.ts, self.analysis = ts, analyse(self.mechanism) if analysis is None else analysis
-        self.state = assemble(self.mechanism, float(ts[0]))
         self.compiled = compile_concrete(self.mechanism, self.analysis, *choices.of_mechanism)
         plan = self.compiled.plan
         if plan.why_not_native:
@@ -74,7 +73,8 @@ class SceneCode:
         if plan.shares_by_marks:
             why = "friction depends on the loads of joints, and rows that may be redundant share these"
             raise ArgumentError(f"no C for this scene: {why}; remove the redundant constraint that udkjax.diagnose names")
-        start = State(np.asarray(self.state.q).ravel(), np.asarray(self.state.v).ravel())
+        closed = assemble(self.mechanism, float(ts[0]))
+        start = State(np.asarray(closed.q).ravel(), np.asarray(closed.v).ravel())
         self.problem: Problem = prepare_run(self.compiled, self.analysis, ts, start, None, choices, np).problem
         assert plan.operation is not None  # there is machine code
         self.operation = plan.operation if stiff else replace(plan.operation, changes=False, leaves=False)
@@ -86,10 +86,6 @@ class SceneCode:
     def n(self) -> int:
         """Count of coordinates."""
         return self.operation.code.coordinate_count
-
-    @property
-    def coordinate_names(self) -> list[str]:
-        return [f"body.{body}.{x}" for body in self.mechanism.body_names for x in COORDINATES]
 
     @cached_property
     def inputs(self) -> dict[str, np.ndarray]:
@@ -107,16 +103,14 @@ class SceneCode:
     def run(self) -> tuple[str, CUnit]:
         """Return `run` and `step`."""
         unit, text = self._integration(self.operation)
-        return (
-            f"""{text}
+        text += f"""
 int {self.prefix}_run(const double *numbers, const double *ts, int times, const double *q, const double *v, double *qs,
     double *vs, double *violation, double *info, double *memory)
 {{
     return integrate(numbers, ts, times, q, v, qs, vs, violation, info, memory, 0.0, {number_text(self._settings["max_steps"])});
 }}
-{self._step("step", "double *q, double *v")}""",
-            unit,
-        )
+{self._step("step", "double *q, double *v")}"""
+        return text, unit
 
     def step_derivatives(self) -> tuple[str, CUnit]:
         """Return `step` with its derivative along a direction."""
@@ -297,18 +291,18 @@ static int integrate(const double *numbers, const double *ts, int times, const d
         return operation
 
     @property
-    def _numbered(self) -> Mechanism:
-        return self.compiled.textbook.mechanism
-
-    @property
     def _own_numbers(self) -> np.ndarray:
-        return scene_numbers(self.mechanism)
+        """The numbers of the scene, without marks and thresholds."""
+        return NumberProgram(self.mechanism, {}, lambda given: given.without_origin).base
 
     def _of_state(
         self, operation: Operation, head: str, values: dict, before: str = "", after: str = "", settings: Any = None
     ) -> tuple[str, CUnit]:
         unit = c_unit(operation, int(operation.tangents > 0))
-        found = settings or scene_inputs(self.compiled.equations, self._numbered, operation.code.policy, np).settings
+        found = (
+            settings
+            or scene_inputs(self.compiled.equations, self.compiled.textbook.mechanism, operation.code.policy, np).settings
+        )
         given = np.array([float(found[name]) for name in operation.all_settings])
         record = {"numbers": "numbers", "ts": "ts", "q": "q", "v": "v", "settings": "settings", "rows": "rows", "times": "2"}
         text = f"""
@@ -323,37 +317,21 @@ static int integrate(const double *numbers, const double *ts, int times, const d
 """
         return unit.text + text, unit
 
-    def parameters(self, names: Sequence[str]) -> tuple[str, dict[str, float]]:
-        """Return the function that sets parameters, and the values of the parameters one number at a time."""
+    def parameters(self, names: Sequence[str], along: bool = False) -> tuple[str, dict[str, float]]:
+        """Return the function that sets parameters, or that turns their changes into those of the numbers; and their values."""
         values = scalar_parameters(self.mechanism, names)
         program = NumberProgram(self.mechanism, values, lambda given: given.without_origin)
-        moved = [k for k in program.changing if k >= program.count]
-        if moved:
-            raise ArgumentError(
-                "parameters move times at which the motion is not smooth: leave out those of motion laws over time"
-            )
-        text = c_function(program.function()) if values else ""
-        call = (
-            "    numbers((double *)(uintptr_t)parameters, values);"
-            if program.changing
-            else "    (void)parameters;\n    (void)values;"
-        )
-        head = f"void {self.prefix}_set_parameters(const double *parameters, double *values)"
-        return f"{text if program.changing else ''}\n{head}\n{{\n{call}\n}}\n", values
-
-    def parameters_along(self, names: Sequence[str]) -> str:
-        """Return the function that turns changes of parameters into changes of the numbers."""
-        values, p = scalar_parameters(self.mechanism, names), self.prefix
-        program = NumberProgram(self.mechanism, values, lambda given: given.without_origin)
-        head = f"void {p}_set_parameters_along(const double *parameters, double *dnumbers)"
-        text = c_function(program.function_along()) if program.changing else "#include <string.h>\n"
-        call = "numbers_along((double *)(uintptr_t)parameters, dnumbers)" if program.changing else "(void)parameters"
-        return f"{text}\n{head}\n{{\n    memset(dnumbers, 0, {len(self.numbers)} * sizeof *dnumbers);\n    {call};\n}}\n"
-
-
-def scene_numbers(mechanism: Mechanism) -> np.ndarray:
-    """Return the numbers of a scene as its programs take them, without thresholds."""
-    return NumberProgram(mechanism, {}, lambda given: given.without_origin).base
+        if any(k >= program.count for k in program.changing):
+            why = "parameters move times at which the motion is not smooth"
+            raise ArgumentError(f"{why}: leave out those of motion laws over time")
+        name, to = ("numbers_along", "dnumbers") if along else ("numbers", "values")
+        text, call = "#include <string.h>\n", f"(void)parameters, (void){to};"
+        if program.changing:
+            text = c_function(program.function_along() if along else program.function())
+            call = f"{name}((double *)(uintptr_t)parameters, {to});"
+        clear = f"    memset(dnumbers, 0, {len(self.numbers)} * sizeof *dnumbers);\n" if along else ""
+        head = f"void {self.prefix}_set_parameters{'_along' if along else ''}(const double *parameters, double *{to})"
+        return f"{text}\n{head}\n{{\n{clear}    {call}\n}}\n", values
 
 
 def _arrays(**arrays: np.ndarray) -> str:
