@@ -23,16 +23,20 @@ DRIVER = """
 #include <stdio.h>
 #include "fmi3.h"
 #include "model.h"
+fmi3Instance fmi3InstantiateCoSimulation(); /* without the types of arguments, which calls give */
+fmi3Status fmi3EnterInitializationMode(), fmi3ExitInitializationMode(), fmi3SetFloat64(), fmi3DoStep(), fmi3GetFloat64();
 int main(void)
 {
     const fmi3ValueReference drive = DRIVE, state[] = {1, 2, 3, 4, 5, 6};
     const fmi3Float64 torque = 0.5;
+    const size_t one = 1, six = 6, none = 0;
     fmi3Float64 found[6], reached;
     fmi3Boolean event, end, early;
-    fmi3Instance one = fmi3InstantiateCoSimulation("one", TOKEN, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0);
-    int wrong = fmi3EnterInitializationMode(one, 0, 0.0, 0.0, 0, 0.0) || fmi3ExitInitializationMode(one);
-    wrong = wrong || fmi3SetFloat64(one, &drive, 1, &torque, 1) || fmi3DoStep(one, 0.0, 0.1, 0, &event, &end, &early, &reached);
-    wrong = wrong || fmi3GetFloat64(one, state, 6, found, 6);
+    void *null = 0;
+    fmi3Instance m = fmi3InstantiateCoSimulation("m", TOKEN, null, 0, 0, 0, 0, null, none, null, null, null);
+    int wrong = fmi3EnterInitializationMode(m, 0, 0.0, 0.0, 0, 0.0) || fmi3ExitInitializationMode(m);
+    wrong = wrong || fmi3SetFloat64(m, &drive, one, &torque, one) || fmi3DoStep(m, 0.0, 0.1, 0, &event, &end, &early, &reached);
+    wrong = wrong || fmi3GetFloat64(m, state, six, found, six);
     for (int k = 0; k < 6; k++) printf("%.17g\\n", found[k]);
     return wrong;
 }
