@@ -1,5 +1,7 @@
-"""User-defined systems, and the diffrax engine, compared with plain scripts for diffrax."""
+"""User-defined systems, and the diffrax engine, compared with plain scripts for diffrax; chains of rods in space."""
 
+import tempfile
+from pathlib import Path
 from typing import Any
 
 import diffrax
@@ -8,8 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 
 import udkjax as udk
-from benchmarks.common import Compiled, in_turn, ratio
+from benchmarks.common import Compiled, cpu_seconds, in_turn, ratio
 from benchmarks.scripts import solve
+from benchmarks.startup import waited
 
 GRAVITY, LENGTH, MASS = 9.81, 1.0, 2.0
 START = (jnp.array([0.6, 0.0, -0.8]), jnp.array([0.0, 2.0, 0.0]))  # of the spatial pendulum
@@ -18,6 +21,14 @@ LINKAGES, LINKAGE_END, LINKAGE_OUTPUTS, COARSE = 64, 5.0, 51, 1e-5
 MEMBERS, ROUNDS = 1024, 7
 # Tolerances (m) within which candidates must agree. The script for linkages regularizes its matrix by 1e-4: hence its errors.
 AGREE, LINKAGES_AGREE = 1e-5, 1e-2
+CHAINS, CHAIN_END, CHAIN_OUTPUTS, ROD = (3, 6, 12, 24), 1.0, 11, 0.5  # numbers of rods; s; m
+FIRST = """
+from benchmarks.systems import chain_times, spatial_chain
+import udkjax as udk
+system, start, _ = spatial_chain({rods})
+udk.simulate(system, chain_times(), start)
+"""
+IMPORTS = "import jax, diffrax, udkjax, benchmarks.systems; udkjax.simulate, udkjax.State"
 
 
 def by_udkjax(length: Any) -> jax.Array:
@@ -83,6 +94,67 @@ def linkages_by_script(angles: Any) -> jax.Array:
     return jax.vmap(lambda angle: run(start(angle), COARSE))(angles)
 
 
+def spatial_chain(rods: int) -> tuple[udk.ConstrainedSystem, udk.State, udk.Mechanism]:
+    """Return rods that hang from each other by balls, with unit quaternions, their state at rest, and the same in the plane."""
+    half, inertia = jnp.array([0.0, 0.0, ROD / 2]), jnp.array([0.02, 0.02, 0.001])
+
+    def turned(p, x):
+        return x + 2 * jnp.cross(p[1:], jnp.cross(p[1:], x) + p[0] * x)
+
+    def kinetic(q, dq):
+        w, x, y, z = q[3:]
+        omega = 2 * jnp.array([[-x, w, z, -y], [-y, -z, w, x], [-z, y, -x, w]]) @ dq[3:]
+        return (dq[:3] @ dq[:3] + omega @ (inertia * omega) + 0.02 * (2 * q[3:] @ dq[3:]) ** 2) / 2
+
+    def rows(t, q):
+        q = q.reshape(rods, 7)
+        tops, ends = (jax.vmap(lambda one, s=s: one[:3] + turned(one[3:], s * half))(q) for s in (1.0, -1.0))
+        pins = tops - jnp.concatenate([jnp.zeros((1, 3)), ends[:-1]])
+        return jnp.concatenate([pins.ravel(), jnp.sum(q[:, 3:] ** 2, axis=1) - 1.0])
+
+    system = udk.ConstrainedSystem.of_energy(
+        lambda q, dq: jnp.sum(jax.vmap(kinetic)(q.reshape(rods, 7), dq.reshape(rods, 7))),
+        potential=lambda t, q: GRAVITY * jnp.sum(q.reshape(rods, 7)[:, 2]),
+        constraint=rows,
+    )
+    angles, end, q, bodies, pins = 0.6 + 0.1 * np.arange(rods), np.zeros(3), np.zeros((rods, 7)), {}, {}
+    for k, angle in enumerate(angles):
+        along = ROD * np.array([np.sin(angle), 0.0, np.cos(angle)])
+        q[k] = [*(end - along / 2), np.cos(angle / 2), 0.0, np.sin(angle / 2), 0.0]
+        end = end - along
+        bodies[f"rod{k}"] = udk.Body(1.0, float(inertia[0]), q[k, [0, 2]], -angle)
+        above = [f"rod{k - 1}", [0.0, -ROD / 2]] if k else ["ground", [0.0, 0.0]]
+        pins[f"pin{k}"] = udk.Revolute([above[0], f"rod{k}"], [above[1], [0.0, ROD / 2]])
+    planar = udk.Mechanism(bodies, pins, gravity=[0.0, -GRAVITY])
+    return system, udk.State(q.ravel(), np.zeros(7 * rods)), planar
+
+
+def chain_times() -> np.ndarray:
+    """Return the output times of the runs of chains (s)."""
+    return np.linspace(0.0, CHAIN_END, CHAIN_OUTPUTS)
+
+
+def chains(counts: tuple[int, ...], at_least: float) -> list[dict[str, Any]]:
+    """Print how long the first run of a chain takes, in a process with nothing cached, and a run after it."""
+    print(f"\n{'chains in space, CPU time':36} {'first (s)':>10} {'again (ms)':>11} {'apart (m)':>10}")
+    found, ts = [], chain_times()
+    with tempfile.TemporaryDirectory() as bytecode:
+        waited(FIRST.format(rods=min(counts)), Path(bytecode) / "first", Path(bytecode))  # leaves bytecode behind
+        imports = waited(IMPORTS, Path(bytecode) / "imports", Path(bytecode))["cpu_seconds"]
+        for rods in counts:
+            with tempfile.TemporaryDirectory() as cold:
+                first = waited(FIRST.format(rods=rods), Path(cold), Path(bytecode))["cpu_seconds"] - imports
+            system, start, planar = spatial_chain(rods)
+            run = udk.simulate(system, ts, start)
+            places = np.asarray(run.q).reshape(len(ts), rods, 7)[:, :, [0, 2]]
+            apart = float(np.max(np.abs(places - np.asarray(udk.simulate(planar, ts).q)[..., :2])))
+            assert run.settings["engine"] == "native" and apart < AGREE * rods, (rods, run.settings["engine"], apart)
+            again = 1e3 * cpu_seconds(lambda: udk.simulate(system, ts, start), at_least)  # noqa: B023
+            found.append({"name": f"chain of {rods} rods", "first": first, "ms": again, "apart": apart})
+            print(f"{found[-1]['name']:36} {first:10.2f} {again:11.2f} {apart:10.1e}")
+    return found
+
+
 def main(smoke: bool = False) -> list[dict[str, Any]]:
     """Print times and first calls of udkjax and of the scripts, and the ratios of the times."""
     members, linkages, rounds, at_least = (8, 2, 1, 0.0) if smoke else (MEMBERS, LINKAGES, ROUNDS, 0.02)
@@ -121,4 +193,4 @@ def main(smoke: bool = False) -> list[dict[str, Any]]:
             f"{name:36} {row['ms']:9.3f} {row['script_ms']:11.2f} {row['times_ours']:8.2f} {row['first']:15.2f} "
             f"{row['script_first']:11.2f}"
         )
-    return rows
+    return rows + chains(CHAINS[:1] if smoke else CHAINS, at_least)

@@ -115,6 +115,10 @@ def _claims() -> Iterable[Claim]:
         yield Claim(f"{name}: a script's time relative to ours", "systems", least, value("times_ours", name=name), True)
     for name, most in (("spatial pendulum", 1.0), ("its gradient", 1.5)):
         yield Claim(f"{name}: first call, s", "systems", most, value("first", name=name))
+    for rods, first, again in ((3, 3.0, 2.0), (6, 6.0, 4.0), (12, 15.0, 10.0), (24, 30.0, 25.0)):
+        name = f"chain of {rods} rods"
+        yield Claim(f"{name} in space: first run, CPU s", "systems", first, value("first", name=name))
+        yield Claim(f"{name} in space: a run of 1 s, CPU ms", "systems", again, value("ms", name=name))
     for case in IDENTIFIED:
         reached = value("reached", name=case, protocol="without noise")
         yield Claim(f"identified from within 50 %, {case}: share right to 1e-8", "identification", 0.95, reached, True)

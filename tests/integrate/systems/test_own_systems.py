@@ -12,6 +12,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax as udk
+from benchmarks.systems import spatial_chain
 from tests.fresh_process import python
 from tests.integrate.systems.own_systems import G, pendulum
 from udkjax.equations import equations_of
@@ -377,55 +378,19 @@ for function in (lambda: udk.diagnose(system), lambda: udk.simulate(system, ts, 
     assert python(code, JAX_ENABLE_X64="0").split() == ["float32", "True", "True", "True", "True"]
 
 
-def spatial_chain(n, length=0.5, inertia=(0.02, 0.02, 0.001)):
-    """Rods that hang from each other by balls, each with a unit quaternion, and their state at rest in the plane of x and z."""
-    half, J = jnp.array([0.0, 0.0, length / 2]), jnp.asarray(inertia)
-
-    def turned(p, x):
-        return x + 2 * jnp.cross(p[1:], jnp.cross(p[1:], x) + p[0] * x)
-
-    def kinetic(q, dq):
-        w, x, y, z = q[3:]
-        omega = 2 * jnp.array([[-x, w, z, -y], [-y, -z, w, x], [-z, y, -x, w]]) @ dq[3:]
-        return (dq[:3] @ dq[:3] + omega @ (J * omega) + 0.02 * (2 * q[3:] @ dq[3:]) ** 2) / 2
-
-    def rows(t, q):
-        q = q.reshape(n, 7)
-        tops, ends = (jax.vmap(lambda one, s=s: one[:3] + turned(one[3:], s * half))(q) for s in (1.0, -1.0))
-        pins = tops - jnp.concatenate([jnp.zeros((1, 3)), ends[:-1]])
-        return jnp.concatenate([pins.ravel(), jnp.sum(q[:, 3:] ** 2, axis=1) - 1.0])
-
-    system = udk.ConstrainedSystem.of_energy(
-        lambda q, dq: jnp.sum(jax.vmap(kinetic)(q.reshape(n, 7), dq.reshape(n, 7))),
-        potential=lambda t, q: 9.81 * jnp.sum(q.reshape(n, 7)[:, 2]),
-        constraint=rows,
-    )
-    angles = 0.6 + 0.1 * np.arange(n)
-    q, end = np.zeros((n, 7)), np.zeros(3)
-    for k, angle in enumerate(angles):
-        along = length * np.array([np.sin(angle), 0.0, np.cos(angle)])
-        q[k] = [*(end - along / 2), np.cos(angle / 2), 0.0, np.sin(angle / 2), 0.0]
-        end = end - along
-    return system, q, angles
-
-
 @pytest.mark.slow
 def test_a_long_chain_in_space_swings_in_its_plane_as_a_planar_one():
     """56 coordinates and 32 rows, 8,000 operations, by machine code: derivatives and batches, too."""
-    n, length, ts = 8, 0.5, np.linspace(0.0, 1.0, 6)
-    system, q, angles = spatial_chain(n, length)
-    bodies = {f"rod{k}": udk.Body(1.0, 0.02, q[k, [0, 2]], -angles[k]) for k in range(n)}
-    pairs = [("ground", "rod0"), *((f"rod{k}", f"rod{k + 1}") for k in range(n - 1))]
-    top, low = [0.0, length / 2], [0.0, -length / 2]
-    pins = {f"pin{k}": udk.Revolute(list(pair), [low if k else [0.0, 0.0], top]) for k, pair in enumerate(pairs)}
-    planar = udk.simulate(udk.Mechanism(bodies, pins, gravity=[0.0, -9.81]), ts, rtol=1e-10, atol=1e-10)
+    n, ts = 8, np.linspace(0.0, 1.0, 6)
+    system, start, in_plane = spatial_chain(n)
+    planar = udk.simulate(in_plane, ts, rtol=1e-10, atol=1e-10)
 
     def places(spin):
-        state = udk.State(q.ravel(), spin * jnp.asarray(turning))
+        state = udk.State(start.q, spin * jnp.asarray(turning))
         return udk.simulate(system, ts, state, rtol=1e-10, atol=1e-10).q.reshape(len(ts), n, 7)[..., :3]
 
-    turning = udk.assemble(system, 0.0, udk.State(q.ravel(), np.tile([0, 1, 0, 0, 0, 0, 0.0], n))).v
-    run = udk.simulate(system, ts, udk.State(q.ravel(), np.zeros(7 * n)), rtol=1e-10, atol=1e-10)
+    turning = udk.assemble(system, 0.0, udk.State(start.q, np.tile([0, 1, 0, 0, 0, 0, 0.0], n))).v
+    run = udk.simulate(system, ts, start, rtol=1e-10, atol=1e-10)
     assert run.settings["engine"] == "native"
     assert_allclose(run.q.reshape(len(ts), n, 7)[..., [0, 2]], planar.q[..., :2], atol=1e-7)
     assert np.abs(udk.violation(system, run)).max() < 1e-12
