@@ -171,13 +171,7 @@ def test_entries_show_their_equations_typeset(name):
 
 # Pages that show code or tables only, until someone draws what they compute.
 WITHOUT_PICTURE = {
-    *(f"how-to/{name}.md" for name in ("animate", "cluster", "control", "design", "draw", "engines", "exercises", "force")),
-    *(
-        f"how-to/{name}.md"
-        for name in ("friction", "gpu", "identify", "identify-friction", "joint", "live", "mjcf", "neural-force")
-    ),
-    *(f"how-to/{name}.md" for name in ("own-method", "own-system", "speed", "sweep", "yield")),
-    "how-to/export.md",
+    *(f"how-to/{name}.md" for name in ("animate", "cluster", "engines", "exercises", "export", "gpu", "live", "mjcf", "speed")),
     *(f"theory/{name}.md" for name in ("atlas", "methods", "symbols")),
 }
 
