@@ -148,8 +148,10 @@ def headline(data: xarray.Dataset) -> str:
         f"{error.size} letters: mean {float(error.mean()):.4f}, median {float(error.median()):.4f}, "
         f"largest {float(error.max()):.4f}, on average {float(letters.seconds.mean()):.0f} s of CPU time and "
         f"{float(letters.bars_used.mean()):.1f} bars; {classics}; {met:.0%} of {data.sizes['linkage']} curves of random linkages "
-        f"below {MET}; errors of {ratio.size} letters by BFGS larger by factors of {ratio.min():.2g} to {ratio.max():.2g}, "
-        f"{middle:.2g} in the middle; errors of {names} with {data.sizes['seed']} seeds apart by factors of up to {apart:.2g}"
+        f"below {MET}, in {float(data.random_seconds.mean()):.1f} s each; "
+        f"errors of {ratio.size} letters by BFGS larger by factors of {ratio.min():.2g} to {ratio.max():.2g}, "
+        f"{middle:.2g} in the middle; errors of {names} with {data.sizes['seed']} seeds apart by factors of up to {apart:.2g}; "
+        f"every mechanism is followed over a turn, in at most {1e3 * float(data.following.max()):.0f} ms"
     )
 
 

@@ -33,6 +33,23 @@ class StepAside(NamedTuple):
     free: float = 1e-6  # smallest tangent part of a direction or a velocity, in the scene's units; less is rounding
 
 
+class DigitsRule(NamedTuple):
+    """Where ten digits of the second derivatives q'' of positions are correct.
+
+    With the distance sigma of the rows from dependence, relative to its largest value, and its rate c along the arc, rounding
+    errors of q'' are 1e-16 (1 / sigma^2 + c^2 / sigma^3). Near a meeting of branches c is about one. Where links are short beside
+    the mechanism, sigma is small over much of the motion, but c is small, too.
+    """
+
+    clear: float = 1e-2  # the least sigma if c is one
+    least: float = 1e-3  # the least sigma if c is zero
+    arc: float = 1e-4  # over which c is a difference, in units of the scene's scales
+
+    def hold(self, sigma: Any, rate: Any) -> Any:
+        """Return whether they are correct, with arrays or values of machine code."""
+        return (sigma > self.least) & (rate * rate * self.clear**3 < sigma * sigma * sigma)
+
+
 class ClosingRule(NamedTuple):
     """Criteria of a closed position, and of the steps that approach it.
 
@@ -47,6 +64,7 @@ class ClosingRule(NamedTuple):
     pace_steps: int = 4  # steps over which the rate of convergence is measured: see `try_to_close`
     velocities: int = 2  # corrections of v: the second removes the rounding errors of the first
     aside: StepAside = StepAside()  # from a position that may be singular
+    digits: DigitsRule = DigitsRule()  # of derivatives of closed positions
     halvings: int = 12  # maximum for one step: if 2^-12 of a step does not lower the residual, the position cannot be closed
 
     def shortening(self, size: Any, xp: ArrayLibrary) -> Any:

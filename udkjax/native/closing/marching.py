@@ -2,9 +2,9 @@
 
 A step predicts by the third-order Taylor polynomial of q(s), from q', q'' and the change of q'', and corrects twice by Newton's
 method with elimination. A position is sound if it is closed up to rounding errors, is near its prediction, has a small rotation
-of the tangent, and has no nearly dependent row. Values that are far apart are reached in several steps: each lane halves a step
-that does not lead to a sound position, and lengthens the steps after one that does. A lane stops where even the shortest step
-fails, at its last sound position; from there the caller continues by singular values.
+of the tangent, and is so far from dependent rows that enough digits of q'' are correct. Values that are far apart are reached in
+several steps: each lane halves a step that does not lead to a sound position, and lengthens the steps after one that does. A lane
+stops where even the shortest step fails, at its last sound position; from there the caller continues by singular values.
 
 If the mechanism has as many independent rows as coordinates, each position has a side, the sign of det Psi_q of these rows. The
 side changes where branches meet, and differs on another branch nearby. If it changes more than once on the way to a value, the
@@ -33,7 +33,6 @@ _METHOD = LUCode(relative=True)
 LONGEST, SHORTEST = 1.0, 1e-3
 MAX_STEPS = 2000  # in addition to four for each value: enough for some hundred turns
 LENGTHENING = 1.5  # below 2, so that a step which had to be halved is not tried again at once
-DISTANT = 1e-2  # smallest distance from dependent rows: below, elimination loses more than half of the digits of q''
 
 
 class _Going:
@@ -192,7 +191,28 @@ class Marching(Module):
         is_near = deviation.value < f.abs(h) * old_rate * SLACK + largest.value * (64 * eps)
         is_closed = ~(violated > largest.value * (CLOSURE.rounding * eps)) & f.is_finite(violated)
         is_smooth = (is_straight & is_near) | begins
-        return is_closed & (s.distance > DISTANT) & is_smooth, old_rate, new_rate
+        return is_closed & self._has_digits(f, s, new_rate) & is_smooth, old_rate, new_rate
+
+    def _has_digits(self, f: Function, s: Lane, arc_rate: Value) -> Value:
+        """Return whether enough digits of q'' are correct: near dependent rows by the distances here and a little farther on."""
+        rule, here, now = CLOSURE.digits, s.distance, getattr(s, "state t")
+        is_clear, result = here > rule.clear, f.variable(0.0)
+        result.where(is_clear, 1.0)
+        with f.if_(f.any_of((here > rule.least) & ~is_clear)):
+            h = f.const(rule.arc) / arc_rate
+            with f.each(self.n) as i:
+                q = self.entry(f, "state q", i)
+                self.put_entry(f, "prediction", i, q)
+                self.put_entry(f, "state q", i, f.fma(h, self.entry(f, "result dq", i), q))
+            setattr(s, "state t", now + h)
+            self.invoke(f, "value_derivatives")
+            holds = rule.hold(here, f.abs(s.distance - here) * (1.0 / rule.arc))
+            with f.each(self.n) as i:
+                self.put_entry(f, "state q", i, self.entry(f, "prediction", i))
+            setattr(s, "state t", now)
+            self.invoke(f, "value_derivatives")
+            result.where(holds, 1.0)
+        return result.value > 0.5
 
     def step_all(self, f: Function, s: Lane, fill):
         f.call("march", f.given["work"], f.given["call"])

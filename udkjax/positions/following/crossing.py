@@ -13,15 +13,12 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from udkjax.equations.rows.position_closure import CLOSURE
 from udkjax.positions.following.curve import AbstractCurve
 
-# Bounds on singular values sigma of E, relative to the largest. Near a meeting of branches sigma grows by about one per unit of
-# the arc, and rounding errors are 1e-16 / sigma in q, 1e-16 / sigma^2 in q' and 1e-16 / sigma^3 in q''. Below NEAR_LOSS, fewer
-# than ten digits of q'' are correct, and q'' is interpolated; below LOST_RANK no digit is correct.
-NEAR_LOSS, LOST_RANK = 1e-2, 1e-5
-# If sigma grows by c per unit, the error of q'' is 1e-16 (1 / sigma^2 + c^2 / sigma^3): where c is small, as with links that are
-# short beside the mechanism, ten digits are correct from SMALL on. Over RATE_ARC along the tangent, c is a difference.
-SMALL, RATE_ARC = NEAR_LOSS**1.5, 1e-3
+# Bounds on singular values sigma of E, relative to the largest. Near a meeting of branches, rounding errors are 1e-16 / sigma in
+# q, 1e-16 / sigma^2 in q' and 1e-16 / sigma^3 in q'', which is interpolated below NEAR_LOSS; below LOST_RANK no digit is correct.
+NEAR_LOSS, LOST_RANK = CLOSURE.digits.clear, 1e-5
 # Largest scaled distance from a meeting at which a step along the tangent still crosses it; the tangent turns by about a degree.
 CLOSE_DISTANCE = 0.02
 # Values of h, scaled. Errors of the polynomials are 3e-10, 3e-15 and less with these, if the next singularity of q(s) is one unit
@@ -65,12 +62,11 @@ class Crossing(NamedTuple):
     spacing: Float[Array, ""]  # the step h
 
 
-def _is_accurate(curve: AbstractCurve, X: Array, tau: Array) -> Bool[Array, ""]:
-    """Return whether ten digits of q'' are correct without interpolation."""
-    by, xp = curve.by, curve.by.xp
-    clearance = by.map(curve.clearance, X + RATE_ARC * xp.array([0.0, -1.0, 1.0])[:, None] * tau)
-    rate = xp.max(xp.abs(clearance - clearance[0])) / RATE_ARC
-    return (clearance[0] > SMALL) & (rate**2 * NEAR_LOSS**3 < clearance[0] ** 3)
+def _has_digits(curve: AbstractCurve, X: Array, tau: Array) -> Bool[Array, ""]:
+    """Return whether enough digits of q'' are correct without interpolation."""
+    by, xp, rule = curve.by, curve.by.xp, CLOSURE.digits
+    sigma = by.map(curve.clearance, X + rule.arc * xp.array([0.0, -1.0, 1.0])[:, None] * tau)
+    return rule.hold(sigma[0], xp.max(xp.abs(sigma - sigma[0])) / rule.arc)
 
 
 def find_crossing(curve: AbstractCurve, X: Float[Array, "n+1"], tau: Float[Array, "n+1"]) -> tuple[Crossing, Bool[Array, ""]]:
@@ -98,7 +94,7 @@ def find_crossing(curve: AbstractCurve, X: Float[Array, "n+1"], tau: Float[Array
     by, xp = curve.by, curve.by.xp
     spacings, unknown = xp.asarray(SPACINGS, X.dtype), xp.zeros_like(X[:-1])
     none = Crossing(X, tau, unknown, unknown, unknown, spacings[0]), xp.asarray(False)
-    return by.cond(_is_accurate(curve, X, tau), lambda: none, interpolated)
+    return by.cond(_has_digits(curve, X, tau), lambda: none, interpolated)
 
 
 def find_toggle(curve: AbstractCurve, X: Float[Array, "n+1"], tau: Float[Array, "n+1"]) -> tuple[Array, Bool[Array, ""]]:
