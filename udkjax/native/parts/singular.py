@@ -9,6 +9,7 @@ from udkjax.native.module.steps import (
     NEAR,
     NEAREST_STAGE,
     RETRIES,
+    ROUNDING_ACROSS,
     ROUNDING_GROWTH,
     SHORTEST_LAST,
     SURE,
@@ -51,7 +52,7 @@ def limit_of_error(f: Function, s: Lane, method: Method, time_left: Value) -> Va
     is_certain = f.abs(straight - time_left) < s.step * method.clearance
     crosses = (s.fallback > 0.5) & (s.begin < 0.5) & (time_left > 0.0) & (time_left < s.step) & is_certain
     nearest = s.distance2 * (s.step * method.clearance / f.select(crosses, time_left, 1.0))
-    rounding = s.step * s.omega * ROUNDING_GROWTH / (nearest * nearest * nearest * s.tolerance)
+    rounding = ROUNDING_ACROSS / (nearest * nearest * s.tolerance)
     return f.select(crosses, f.max(rounding, 1.0), 1.0)
 
 
