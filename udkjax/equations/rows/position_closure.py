@@ -34,7 +34,7 @@ class StepAside(NamedTuple):
 
 
 class DigitsRule(NamedTuple):
-    """Where ten digits of the second derivatives q'' of positions are correct.
+    """The distance from dependent rows beyond which ten digits of the second derivatives q'' of positions are correct.
 
     With the distance sigma of the rows from dependence, relative to its largest value, and its rate c along the arc, rounding
     errors of q'' are 1e-16 (1 / sigma^2 + c^2 / sigma^3). Near a meeting of branches c is about one. Where links are short beside

@@ -32,7 +32,7 @@ NEAR = 0.1
 # The rounding error of accelerations, in the scene's own units, is this number divided by the cube of the distance. Its
 # contribution to the velocity in a step must be less than the tolerance.
 ROUNDING_GROWTH = 3e-14
-# That of the velocity after a step across, in the same units, is this number divided by the square of the distance: a few eps. A
+# The rounding error of a velocity across, in the same units, is this number divided by the square of the distance: a few eps. A
 # larger one lets errors of the method pass: with 1e-14, an overconstrained chain in space loses a thousand times its tolerance.
 ROUNDING_ACROSS = 1e-15
 # SURE: fraction of a step. If a singular configuration is predicted before this fraction, the step certainly passes it:
