@@ -300,6 +300,40 @@ def test_derivatives_equal_those_of_jax_forward_and_adjoint(instance):
         one.derivative("Directional", a, ["time"], [1.0])
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [*sorted(udk.library.__all__), *DRAWINGS], ids=lambda x: Path(x).stem)
+def test_derivatives_of_every_scene_equal_those_of_jax(name, tmp_path):
+    """Directional and adjoint, of closed states and accelerations with respect to the states, redundant rows included."""
+    mechanism, rng = scene(name), np.random.default_rng(0)
+    file = udk.export_fmu(mechanism, tmp_path / "a.fmu", options=options()).file
+    one, names = Instance(file, tmp_path / "a", "ModelExchange"), states(mechanism)
+    a = [f"body.{b}.{x}" for b in mechanism.body_names for x in ("ax", "ay", "alpha")]
+    assert one.begin() == OK and one.update()[0] is False and one.call("EnterContinuousTimeMode") == OK
+    start, seed = one.get(*(f"state.{x}" for x in names)), rng.normal(size=len(names))
+
+    def found_by_jax(x):
+        (q, v), of = x.reshape(2, -1), udk.equations
+        root = jnp.sqrt(of.mass(mechanism))
+
+        def corrected(x, left, at):
+            return x - jnp.linalg.pinv(of.psi_q(mechanism, 0.0, at) / root, rcond=1e-9) @ left / root
+
+        q = corrected(q, of.psi(mechanism, 0.0, q), q)
+        v = corrected(v, of.psi_dot(mechanism, 0.0, q, v), q)
+        a = udk.accelerations(mechanism, 0.0, q.reshape(-1, 3), v.reshape(-1, 3))
+        return jnp.concatenate([q, v, jnp.ravel(a)])
+
+    wanted = np.asarray(jax.jit(lambda x: jax.jvp(found_by_jax, (x,), (seed,))[1])(jnp.asarray(start)))
+    known = [f"state.{x}" for x in names]
+    found = one.derivative("Directional", [*names, *a], known, seed)
+    size = np.abs([*wanted, *seed]).max()  # of a driven scene nothing moves
+    assert_allclose(found, wanted, rtol=0.0, atol=1e-12 * size)
+    back = rng.normal(size=len(found))
+    assert_allclose(
+        one.derivative("Adjoint", [*names, *a], known, back) @ seed, back @ found, rtol=0.0, atol=1e-12 * size * len(found)
+    )
+
+
 def test_a_drawing_s_pins_move_the_start(tmp_path):
     mechanism = udk.library.slider_crank()
     found = udk.export_fmu(mechanism, tmp_path / "a.fmu", ["co-simulation"], ["pin.P"], stiff=False, options=["-O0"])
