@@ -10,7 +10,7 @@ from udkjax.show import doctor
 
 def test_a_good_environment_gets_no_advice():
     found = doctor.facts()
-    assert found["advice"] == [] and set(found["missing_extras"]) <= {"notebook"}  # an extra of its own
+    assert found["advice"] == [] and set(found["missing_extras"]) <= {"notebook", "zig"}  # extras of their own
     assert (found["engine"], found["precision"]) == ("native", "float64")
     assert {"udkjax", "jax", "jaxlib", "equinox", "diffrax", "llvmlite", "numpy", "python"} <= set(found["versions"])
     shown = doctor.summary(found)
