@@ -33,7 +33,7 @@ NEAR = 0.1
 # contribution to the velocity in a step must be less than the tolerance.
 ROUNDING_GROWTH = 3e-14
 # The rounding error of a velocity across, in the same units, is this number divided by the square of the distance: a few eps. A
-# larger one lets errors of the method pass: with 1e-14, an overconstrained chain in space loses a thousand times its tolerance.
+# larger one lets errors of the method pass: with 1e-14, an overconstrained chain in space loses 15,000 tolerances of its energy.
 ROUNDING_ACROSS = 1e-15
 # SURE: fraction of a step. If a singular configuration is predicted before this fraction, the step certainly passes it:
 # predictions are too early by at most a tenth of a step. From far away they may be too early by three tenths, and the
