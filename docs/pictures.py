@@ -2,6 +2,7 @@
 
 A comment of a page, `<!-- picture`, has code that draws on `axes`, with the names that the page's blocks have defined. A picture
 contains its numbers; the test that runs the blocks compares them with those that it draws, so that no picture is out of date.
+The code of a picture also has `figure`, `np`, `udk` and `root`, the folder of the repository.
 """
 
 import json
@@ -21,6 +22,7 @@ BLOCK = re.compile(r"^```python\n(.*?)^```", re.S | re.M)
 PICTURE = re.compile(r"^<!-- picture\n(.*?)^-->\n\n!\[([^\]]+)\]\(([^)]+\.svg)\)", re.S | re.M)
 SAMPLES = 9  # of each curve, which are compared
 TOLERANCE = 0.01  # fraction of the range of an axis by which a picture may differ: less than the eye sees
+ROOT = Path(__file__).parents[1]
 INK, GRID = "#101112", "#c0c1c2"  # stand for colours of the page, which are light or dark
 SIZE = 6.4, 3.2  # inches
 STYLE = {
@@ -42,11 +44,14 @@ def draw(code: str, names: dict) -> "Figure":
     from cycler import cycler
     from matplotlib.figure import Figure
 
+    import udkjax
     from udkjax.show.style import COLOURS
+
+    given = {"np": np, "udk": udkjax, "root": ROOT}
 
     with matplotlib.rc_context(STYLE | {"axes.prop_cycle": cycler(color=COLOURS)}):
         figure = Figure(figsize=SIZE, layout="constrained")
-        exec(compile(code, "picture", "exec"), names | {"axes": figure.subplots(), "figure": figure, "np": np})
+        exec(compile(code, "picture", "exec"), given | names | {"axes": figure.subplots(), "figure": figure})
     return figure
 
 
@@ -89,7 +94,8 @@ def save(figure: "Figure", path: Path) -> None:
         facts = {"Description": json.dumps(numbers(figure)), "Date": None}
         figure.savefig(path, format="svg", transparent=True, metadata=facts)
     text = path.read_text(encoding="utf-8").replace(INK, "currentColor").replace(GRID, "var(--color-background-border, #c0c1c2)")
-    text = re.sub(r"#(0072b2|d55e00|009e73|cc79a7)\b", r"var(--curve-\1, #\1)", text)
+    text = text.replace("#000000", "currentColor")
+    text = re.sub(r"#(0072b2|d55e00|009e73|cc79a7|56b4e9|e69f00)\b", r"var(--curve-\1, #\1)", text)
     path.write_text("\n".join(line.rstrip() for line in text.splitlines()) + "\n", encoding="utf-8")
 
 
@@ -103,15 +109,14 @@ def stored(path: Path) -> list[dict]:
 
 def main() -> None:
     """Draw the pictures of the given pages."""
-    root = Path(__file__).parents[1]
     for page in (Path(name).resolve() for name in sys.argv[1:]):
         text, names = page.read_text(encoding="utf-8"), {"__name__": "__page__"}
         with tempfile.TemporaryDirectory() as folder:
             os.chdir(folder)
-            Path("examples").symlink_to(root / "examples")
+            Path("examples").symlink_to(ROOT / "examples")
             for found in BLOCK.finditer(text):
                 exec(compile(found[1], page.name, "exec"), names)
-            os.chdir(root)
+            os.chdir(ROOT)
         for code, _, target in PICTURE.findall(text):
             (page.parent / target).parent.mkdir(exist_ok=True)
             save(draw(code, names), page.parent / target)

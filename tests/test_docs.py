@@ -112,7 +112,7 @@ FIRST = ("README.md",)
     [
         pytest.param(p, id=name_of(p), marks=[] if name_of(p) in FIRST else pytest.mark.slow)
         for p in PAGES
-        if "```python" in p.read_text()
+        if "```python" in p.read_text() or pictures.PICTURE.search(p.read_text())
     ],
 )
 def test_its_blocks_run_and_print_what_it_says(page, tmp_path, monkeypatch):
