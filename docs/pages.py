@@ -1,6 +1,7 @@
 """An extension of Sphinx: what the pages of the site show besides their Markdown.
 
-- Entries of the reference, made from docstrings (`reference_tables.py`), and the commands; tables and plots of the study `atlas`.
+- Entries of the reference, made from docstrings (`reference_tables.py`), each with the block of Python that follows its directive, or
+  with that of the names listed together with it; and the commands; tables and plots of the study `atlas`.
 - Menus: a page whose list of links begins with `<!-- menu -->` shows them as cards, and is a group of the menu.
 - Names of the package in the text lead to their entries, and entries to the pages that use them.
 - Pictures that the code of a page has drawn are put into the page, where they have its colours.
@@ -9,6 +10,7 @@
 import html
 import re
 import shutil
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -23,6 +25,9 @@ FENCE = re.compile(r"(^```.*?^```$)", re.S | re.M)
 PLAYER = re.compile(r"\]\((?!\w+:)([^)\s#]+\.html)\)")
 NAME = re.compile(r"(?<![\[`])`udk\.(\w+)(\([^`]*\))?`(?!\]|`)")
 ENTRY = re.compile(r"^- \[([^\]]+)\]\(([^)]+)\)(?:: (.*(?:\n  .*)*))?", re.M)
+GROUP = re.compile(
+    rf"((?:{reference.DIRECTIVE.pattern}\n*)+)(?:^```python\n((?:.*\n)*?)```\n)?", re.M
+)  # of names, with their example
 DRAWING = re.compile(r"^<!-- picture\n.*?^-->\n", re.S | re.M)  # the code of a picture
 DRAWN = re.compile(r"^!\[([^\]]*)\]\(([^)]+\.svg)\)$", re.M)
 FIRST = "getting-started.md", "tutorial.md"  # pages in which a name is looked for first
@@ -49,7 +54,7 @@ def read(app: Any, name: str, source: list[str]) -> None:
     if ATLAS in text:
         *_, tables = (EXPERIMENTS / "atlas.md").read_text(encoding="utf-8").split("\n", 4)  # after its title and links
         text = text.replace(ATLAS, f"[All plots](atlas-plots.html), by mechanism and choice, are one page.\n{tables}")
-    text = reference.DIRECTIVE.sub(lambda found: entry(found[1], found[2]), text)
+    text = GROUP.sub(lambda found: "\n".join(entries_of(found[1], found[4])), text)
     if MENU in text:
         text = menu(text, (DOCS / name).parent)
     text = DRAWING.sub("", text)
@@ -82,10 +87,20 @@ def entries() -> set[str]:
     }
 
 
-def entry(name: str, options: str | None) -> str:
-    """Return the entry of a public name, with where it is used."""
+def entries_of(directives: str, example: str | None) -> Iterator[str]:
+    """Iterate over the entries of names that share an example: the first shows it, and the others lead there."""
+    said = f"**Example**\n\n```python\n{example}```\n" if example else ""
+    for found in reference.DIRECTIVE.finditer(directives):
+        yield entry(found[1], found[2], said)
+        first = found[1].rpartition(".")[2] if example and "```" in said else ""
+        said = f"**Example** With [`{first}`](#{label(first)}).\n" if first else said
+
+
+def entry(name: str, options: str | None, example: str = "") -> str:
+    """Return the entry of a public name, with an example before its methods, and where it is used."""
     own = name.rpartition(".")[2]
-    return f"({label(own)})=\n{reference.entry(name, options or '')}\n{used(own)}\n"
+    text, heading, methods = reference.entry(name, options or "").partition("\n### ")
+    return f"({label(own)})=\n{text}\n\n{example}{used(own)}{heading}{methods}\n"
 
 
 def label(name: str) -> str:
@@ -116,7 +131,7 @@ def used(name: str) -> str:
     pattern = re.compile(rf"\budk\.(?:pinv\.)?{name}\b")
     places = list(dict.fromkeys((page, section) for page, section, text in blocks() if pattern.search(text)))
     links = [f"[{section}](../{page})" for page, section in places[:4]]
-    return f"\nUsed in: {', '.join(links)}.\n" if links else ""
+    return f"\n**Used in** {', '.join(links)}.\n" if links else ""
 
 
 def menu(text: str, folder: Path) -> str:

@@ -135,7 +135,7 @@ def methods(cls: type, options: str) -> Iterator[list[str]]:
         it = inspect.getattr_static(cls, name)
         function = it.fget if isinstance(it, property) else getattr(it, "func", getattr(it, "__func__", it))
         function = inspect.unwrap(getattr(function, "method", function))
-        if not inspect.isfunction(function) or not function.__doc__:
+        if not inspect.isfunction(function) or not function.__doc__ or function.__doc__.startswith("For internal use"):
             continue
         call = [] if isinstance(it, property) or hasattr(it, "func") else signature(f"{cls.__name__}.{name}", function)
         yield [f"### {cls.__name__}.{name}", "", *call, *description(function)]

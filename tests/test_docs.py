@@ -11,7 +11,7 @@ import inspect
 import re
 import shlex
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
 
@@ -39,7 +39,9 @@ every_page = pytest.mark.parametrize("page", PAGES, ids=name_of)
 
 
 sys.path.insert(0, str(ROOT / "docs"))
+pages = importlib.import_module("pages")
 pictures = importlib.import_module("pictures")
+reference = importlib.import_module("reference_tables")
 
 # --- blocks
 
@@ -59,8 +61,11 @@ def digit(number: str) -> float:
     return 10.0 ** (int(exponent or 0) - len(mantissa.partition(".")[2]))
 
 
-def untrue(text: str, names: dict) -> list[str]:
-    """Run the blocks of a page in order; return the outputs that differ from the stated ones, by line."""
+def untrue(text: str, names: dict, after: Callable[[str, dict], object] | None = None) -> list[str]:
+    """Run the blocks of a page in order; return the outputs that differ from the stated ones, by line.
+
+    `after` is called with the text of a block of Python and with all names, after the block has run.
+    """
     wrong, printed, lines = [], [], text.splitlines()
 
     def show(*values, sep=" ", **_):
@@ -76,6 +81,8 @@ def untrue(text: str, names: dict) -> list[str]:
         if found[1] == "python":
             printed.clear()
             exec(compile("\n" * start + found[2], "page", "exec"), names)  # so that an error names the line of the page
+            if after is not None:
+                after(found[2], names)
             end = found.end()
         elif (
             found[1] == "text"
@@ -119,10 +126,35 @@ def test_its_blocks_run_and_print_what_it_says(page, tmp_path, monkeypatch):
     (tmp_path / "examples").symlink_to(ROOT / "examples")
     monkeypatch.chdir(tmp_path)
     text, names = page.read_text(), {"__name__": "__page__"}
+    if page.parent.name == "reference":
+        examples = Examples(text)
+        assert untrue(text, names, examples.after) == []
+        assert examples.absent == []
+        return
     assert untrue(text, names) == []
     for code, _, target in pictures.PICTURE.findall(text):
         drawn, there = pictures.draw(code, names), pictures.stored(page.parent / target)
         assert pictures.differ(pictures.numbers(drawn), there) == [], f"run: python docs/pictures.py {name_of(page)}"
+
+
+class Examples:
+    """The examples of a page of the reference: each runs after the first block alone, and has what it is an example of."""
+
+    def __init__(self, text: str):
+        self.groups = {found[4]: reference.DIRECTIVE.findall(found[1]) for found in pages.GROUP.finditer(text)}
+        self.first: dict | None = None
+        self.absent: list[str] = []
+
+    def after(self, block: str, names: dict) -> None:
+        """Note the names of a group that its example neither writes nor has as the type of a variable."""
+        types = {cls.__name__ for value in names.values() for cls in type(value).__mro__}
+        for name, _ in self.groups.get(block, []):
+            own = name.rpartition(".")[2]
+            if not re.search(rf"(?:\budk\.(?:\w+\.)?|import ){own}\b", block) and own not in types:
+                self.absent.append(own)
+        self.first = dict(names) if self.first is None else self.first
+        names.clear()
+        names.update(self.first)
 
 
 @every_page
@@ -284,8 +316,6 @@ def test_the_readme_counts_and_lists_what_there_is():
 
 # --- the reference
 
-sys.path.insert(0, str(ROOT / "docs"))
-reference = importlib.import_module("reference_tables")
 CLASSES = sorted(
     name
     for page in (ROOT / "docs/reference").glob("*.md")

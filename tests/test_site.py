@@ -108,6 +108,21 @@ def test_every_public_name_has_an_entry_that_describes_it(name):
     assert len(text.split()) > 8
 
 
+def test_every_name_has_an_example():
+    """The documentation's tests run them."""
+    groups = [found for page in (DOCS / "reference").glob("*.md") for found in pages.GROUP.finditer(page.read_text())]
+    without = [name for found in groups if not found[4] for name, _ in reference.DIRECTIVE.findall(found[1])]
+    assert without == []
+    assert max(len(line) for found in groups for line in found[4].splitlines()) <= 88
+
+
+def test_names_that_stand_together_share_an_example():
+    text = "::: udkjax.travel\n::: udkjax.Travel\n\n```python\nprint(1)\n```\n"
+    one, other = pages.entries_of(pages.GROUP.match(text)[1], pages.GROUP.match(text)[4])
+    assert "**Example**\n\n```python\nprint(1)\n```\n" in one
+    assert "**Example** With [`travel`](#udkjax.travel)." in other and "print(1)" not in other
+
+
 def test_a_name_in_the_text_leads_to_its_entry():
     assert pages.linked("`udk.simulate` and `udk.nothing`", "how-to/x") == "[`udk.simulate`](#udkjax.simulate) and `udk.nothing`"
     assert pages.linked("`udk.Design` of [`udk.design`](a.md)", "a") == "[`udk.Design`](#class.Design) of [`udk.design`](a.md)"

@@ -48,6 +48,7 @@ def test_the_measure_is_that_of_pieces_moved_one_by_one_and_its_derivatives_are_
     x, mechanism = search.problem.free.vector[None], DRAWING.mechanism()
     found, slopes, there = term.measures(x)
     assert there.all()
+    assert [len(each) for each in term.measures(x[:0])] == [0, 0, 0]  # where no trial of a search is left
 
     def measured(u):
         rows = []

@@ -184,7 +184,8 @@ class RobustTerm(CompiledTerm):
         """Return the numbers of all pieces (M E, P + K) of trials (M, P)."""
         M, E, P = len(x), len(self._points), self._numbers
         parts = np.repeat(x[:, None, :P], E, 1), np.tile(self._points, (M, 1, 1)), np.repeat(x[:, None, P:], E, 1)
-        return np.concatenate(parts, 2).reshape(M * E, -1)
+        found = np.concatenate(parts, 2)
+        return found.reshape(M * E, found.shape[2])
 
     def measures(self, x, threads=None, s=None):
         z, (M, E, P) = self._at_points(x), (len(x), len(self._points), self._numbers)
@@ -192,7 +193,7 @@ class RobustTerm(CompiledTerm):
         s = np.repeat(self.values(z[::E]), E, 0) if s is None else s
         m, by_z, exists = super().measures(z, threads, s)
         by_x = np.delete(by_z, np.s_[P : P + len(self._pieces.kurtosis)], 2)
-        found, slopes = self._combine(m.reshape(M, E, -1), by_x.reshape(M, E, *by_x.shape[1:]))
+        found, slopes = self._combine(m.reshape(M, E, *m.shape[1:]), by_x.reshape(M, E, *by_x.shape[1:]))
         return found, slopes, exists.reshape(M, E).all(1)
 
     def _combine(self, m: np.ndarray, by_x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

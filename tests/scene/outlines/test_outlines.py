@@ -142,6 +142,15 @@ def test_svg_files_have_the_areas_of_closed_forms(tmp_path):
     assert half.area == pytest.approx(4 / 3, rel=1e-13)
 
 
+@pytest.mark.parametrize("centre", [50, 55])
+def test_a_circle_of_svg_may_have_a_circle_as_its_hole(tmp_path, centre):
+    """Each circle of a file ends with a line whose length is rounding, which is no contour."""
+    found = svg(tmp_path, f'<circle cx="50" cy="50" r="30"/><circle cx="{centre}" cy="50" r="10"/>')
+    assert len(found.holes) == 1
+    assert found.area == pytest.approx(np.pi * (0.03**2 - 0.01**2), rel=1e-12)
+    assert found.circles[0].radius == pytest.approx(0.01, rel=1e-12)
+
+
 def test_mistakes_in_svg_files_are_named(tmp_path):
     with pytest.raises(udk.SceneError, match='no unit of length; give it, unit="mm"'):
         svg(tmp_path, '<circle r="5"/>', 'width="200" height="100"')

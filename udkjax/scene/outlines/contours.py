@@ -59,7 +59,8 @@ def contours_of(drawn: Sequence[DrawnPiece], scale: float, unit: str) -> tuple[l
     def place(p: np.ndarray) -> str:
         return f"({p[0] / scale:.6g}, {p[1] / scale:.6g}) {unit}"
 
-    rest = list(drawn)
+    # A circle of SVG ends with a line whose length is rounding.
+    rest = [x for x in drawn if np.ptp(x.piece.at(np.linspace(0, 1, 9))[0], axis=0).max() > near]
     while rest:
         first = rest.pop(0)
         chain, name = [first.piece], f"contour {len(found) + 1} ({first.name})"
