@@ -1,7 +1,7 @@
 """An extension of Sphinx: what the pages of the site show besides their Markdown.
 
-- Entries of the reference, made from docstrings (`reference_tables.py`), each with the block of Python that follows its directive, or
-  with that of the names listed together with it; and the commands; tables and plots of the study `atlas`.
+- Entries of the reference, made from docstrings (`reference_tables.py`), and the commands; tables and plots of the study `atlas`.
+- The block of Python after a directive is the example of its name, and of the names listed together with it.
 - Menus: a page whose list of links begins with `<!-- menu -->` shows them as cards, and is a group of the menu.
 - Names of the package in the text lead to their entries, and entries to the pages that use them.
 - Pictures that the code of a page has drawn are put into the page, where they have its colours.
@@ -25,9 +25,8 @@ FENCE = re.compile(r"(^```.*?^```$)", re.S | re.M)
 PLAYER = re.compile(r"\]\((?!\w+:)([^)\s#]+\.html)\)")
 NAME = re.compile(r"(?<![\[`])`udk\.(\w+)(\([^`]*\))?`(?!\]|`)")
 ENTRY = re.compile(r"^- \[([^\]]+)\]\(([^)]+)\)(?:: (.*(?:\n  .*)*))?", re.M)
-GROUP = re.compile(
-    rf"((?:{reference.DIRECTIVE.pattern}\n*)+)(?:^```python\n((?:.*\n)*?)```\n)?", re.M
-)  # of names, with their example
+# Names that stand together, with their example.
+GROUP = re.compile(rf"((?:{reference.DIRECTIVE.pattern}\n*)+)(?:^```python\n((?:.*\n)*?)```\n)?", re.M)
 DRAWING = re.compile(r"^<!-- picture\n.*?^-->\n", re.S | re.M)  # the code of a picture
 DRAWN = re.compile(r"^!\[([^\]]*)\]\(([^)]+\.svg)\)$", re.M)
 FIRST = "getting-started.md", "tutorial.md"  # pages in which a name is looked for first

@@ -24,6 +24,7 @@ MODULE = re.compile(r"\b(?:udkjax|collections|typing|jax|numpy|pathlib|diffrax|o
 SECTION = re.compile(r"^(?=(?:Args|Attributes|Returns|Raises|Source|Yields):\n)", re.M)
 RAISED = re.compile(r"^(\w+(?:, \w+)*): (.*(?:\n +.*)*)", re.M)
 WIDTH = 86  # columns of a call
+BAR = "\\_"  # which makes nothing bold
 ITEM = re.compile(r"^ {4}(\w+(?:, \w+)*): (.*(?:\n {5,}.*)*)", re.M)
 
 
@@ -138,7 +139,7 @@ def methods(cls: type, options: str) -> Iterator[list[str]]:
         if not inspect.isfunction(function) or not function.__doc__ or function.__doc__.startswith("For internal use"):
             continue
         call = [] if isinstance(it, property) or hasattr(it, "func") else signature(f"{cls.__name__}.{name}", function)
-        yield [f"### {cls.__name__}.{name}", "", *call, *description(function)]
+        yield [f"### {cls.__name__}.{name.replace('__', BAR * 2)}", "", *call, *description(function)]
 
 
 def table(cls: type) -> str:

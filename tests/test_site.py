@@ -77,6 +77,14 @@ def test_questions_lead_to_sections():
         "gradient",
         "posterior",
         "transmission angle",
+        "worked solution",
+        "C99",
+        "FMU",
+        "tolerance",
+        "shape of a link",
+        "draws a curve",
+        "compare models",
+        "exercise",
     ],
 )
 def test_a_reader_who_searches_finds_a_question(words):

@@ -62,6 +62,14 @@ DPI = 96  # of plots
 THUMBNAIL = {"width": 260, "fps": 10.0}  # a film beside the short title
 LOOP = 2.4  # s, its length
 MOMENT = 0.3  # fraction of the motion at which its picture is taken
+PLACE = '<div id="player"></div>'  # of a player in its page
+BAR = """<style>
+body { display: flex; flex-direction: column; height: 100vh; height: 100dvh; }
+#player { flex: 1; min-height: 0; --player-height: 100%; }
+#bar { margin: 0; padding: 0.5em 1em; background: Canvas; color: CanvasText; font: 0.95rem/1.4 system-ui, sans-serif; }
+#bar a { color: LinkText; }
+</style>
+"""
 
 
 def make(name: str, out: Path) -> dict:
@@ -75,7 +83,7 @@ def make(name: str, out: Path) -> dict:
     files = []
     for what, thing in shown.items():
         if what == "motion":
-            share_player(thing.save(out / f"{name}.html"))
+            share_player(thing.save(out / f"{name}.html"), name)
             span = thing.data["end"] - thing.data["start"]
             moment = getattr(module, "MOMENT", MOMENT)
             picture = thing.save(out / f"{name}.png", thing.data["start"] + moment * span, width=WIDTH)
@@ -94,7 +102,7 @@ def make(name: str, out: Path) -> dict:
     title, _, words = text.strip().partition("\n")
     return {
         "name": name,
-        "source": f"examples/drawings/{name}.toml" if name in DRAWINGS else f"examples/gallery/{name}.py",
+        "source": source(name),
         "title": title,
         "words": words.strip(),
         "facts": facts,
@@ -115,15 +123,29 @@ def make_drawing(name: str) -> tuple[str, tuple[dict, dict]]:
     mech = udk.load(path)
     sol = udk.simulate(mech, np.linspace(0.0, DRAWINGS[name], FRAMES))
     facts = {
-        "lines of the drawing": float(len(lines)),
         "largest violation of a constraint (m or rad)": float(np.abs(udk.violation(mech, sol)).max()),
     }
     return "\n".join(words), (facts, {"motion": udk.animate(mech, sol, live=True)})
 
 
-def share_player(player: Path) -> None:
+def source(name: str) -> str:
+    """Return the file of an example."""
+    return f"examples/drawings/{name}.toml" if name in DRAWINGS else f"examples/gallery/{name}.py"
+
+
+def with_bar(text: str, name: str) -> str:
+    """Return a page with a line above its player: the way back, what to try, and the file of the example."""
+    short, tried = next(members[name] for members in GROUPS.values() if name in members)
+    section = re.sub(r"[^\w\- ]", "", short.lower()).replace(" ", "-")
+    back = f'<a href="index.html#{section}">Gallery</a>'
+    bar = f'<p id="bar">{back} &middot; <b>Try:</b> {html.escape(tried)} &middot; <code>{source(name)}</code></p>\n'
+    return text.replace(PLACE, f"{BAR}{bar}{PLACE}", 1)
+
+
+def share_player(player: Path, name: str = "") -> None:
     """Take the script out of a page, and put that of live pages, which serves all pages, into `player.js` in the same folder.
 
+    The page of an example gets a line above its player.
     It is a script, since browsers read no modules from a disk, and the page loses its policy, which allows no other scripts.
     """
     from udkjax.show.player.page import module
@@ -132,6 +154,7 @@ def share_player(player: Path) -> None:
     start, _, rest = text.partition('<script type="module">\n')
     _, mount, end = rest.rpartition("\nmount(")
     start = re.sub(r'<meta http-equiv="Content-Security-Policy"[^\n]*\n', "", start)
+    start = with_bar(start, name) if name else start
     player.write_text(f'{start}<script src="{PLAYER}"></script>\n<script>{mount}{end}', encoding="utf-8")
     program = re.sub(r"^export (default .*|)", "", module(), flags=re.MULTILINE)
     shared = f'const mount = (() => {{\n"use strict";\n{program}\nreturn mount;\n}})();\n'

@@ -33,7 +33,8 @@ def make():
         ends = push(middle, ts[:2])[1].result == udk.Result.painleve_paradox
         low, high = (low, middle) if ends else (middle, high)
     facts = {
-        f"angle of the rod at the end, {label} (deg)": float(np.rad2deg(sol.q[-1, 0, 2])) for label, (_, sol) in runs.items()
+        f"angle of the rod at the end, {label} (deg)": abs(round(float(np.rad2deg(sol.q[-1, 0, 2])), 9))
+        for label, (_, sol) in runs.items()
     }
     facts |= {
         "coefficient from which the run ends at once by the paradox": high,

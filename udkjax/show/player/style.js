@@ -5,7 +5,7 @@ export const STYLE = `
 .player { --radius: 8px; box-sizing: border-box; display: flex; flex-direction: column; font: 14px/1.4 system-ui, -apple-system, "Segoe UI",
   Roboto, "Helvetica Neue", Arial, sans-serif; color: var(--ink); background: var(--back); border: 1px solid var(--line);
   border-radius: var(--radius); overflow: hidden; position: relative; }
-.player.fill { height: 100vh; height: 100dvh; border: 0; border-radius: 0; }
+.player.fill { height: 100vh; height: var(--player-height, 100dvh); border: 0; border-radius: 0; }
 .player *, .player *::before { box-sizing: border-box; }
 header { display: flex; align-items: center; gap: 8px; padding: 10px 10px 10px 16px; border-bottom: 1px solid var(--line); }
 h1 { font-size: 15px; font-weight: 600; margin: 0; flex: 1; min-width: 0; overflow: hidden; text-overflow: ellipsis; white-space: nowrap; }
