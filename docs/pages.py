@@ -108,29 +108,38 @@ def label(name: str) -> str:
 
 
 @cache
-def blocks() -> list[tuple[str, str, str]]:
-    """Return the page, the section and the text of each block of Python."""
-    found = []
-    for page in (
-        *(DOCS / name for name in FIRST),
-        *sorted((DOCS / "how-to").glob("*.md")),
-        *sorted((DOCS / "theory").glob("*.md")),
-    ):
+def passages() -> list[tuple[str, str, str]]:
+    """Return the page, the section and the text of each block of Python, then of each passage between them."""
+    pages = DOCS / "how-to", DOCS / "theory"
+    found: dict[bool, list[tuple[str, str, str]]] = {True: [], False: []}
+    for page in (*(DOCS / name for name in FIRST), *(path for folder in pages for path in sorted(folder.glob("*.md")))):
         section = ""
         for part in FENCE.split(page.read_text(encoding="utf-8")):
-            if part.startswith("```python"):
-                found.append((str(page.relative_to(DOCS)), section, part))
-            elif not part.startswith("```"):
-                section = ([section] + re.findall(r"^#+ (.*)$", part, re.M))[-1]
-    return found
+            is_code = part.startswith("```python")
+            for text in [part] if is_code else re.split(r"^(?=#+ )", DRAWING.sub("", part), flags=re.M):
+                section = ([section] if is_code else [section, *re.findall(r"\A#+ (.*)$", text, re.M)])[-1]
+                if is_code or not text.startswith("```"):
+                    found[is_code].append((str(page.relative_to(DOCS)), section, text))
+    return found[True] + found[False]
 
 
 def used(name: str) -> str:
-    """Return a line with links to the sections whose code uses a name; empty if there are none."""
-    pattern = re.compile(rf"\budk\.(?:pinv\.)?{name}\b")
-    places = list(dict.fromkeys((page, section) for page, section, text in blocks() if pattern.search(text)))
-    links = [f"[{section}](../{page})" for page, section in places[:4]]
+    """Return a line with links to the sections whose code, or else whose text, uses a name; empty if there are none."""
+    short = rf"|`{name}\b(?!\.)" if name[0].isupper() else ""  # classes are named without their package, too
+    pattern = re.compile(rf"\budk(?:jax)?\.(?:\w+\.)*{name}\b{short}")
+    places = list(dict.fromkeys((page, section) for page, section, text in passages() if pattern.search(text)))
+    links = [f"[{section}](../{page}{'' if is_title(page, section) else '#' + slug(section)})" for page, section in places[:4]]
     return f"\n**Used in** {', '.join(links)}.\n" if links else ""
+
+
+def is_title(page: str, section: str) -> bool:
+    """Return True if a section is the title of its page."""
+    return (DOCS / page).read_text(encoding="utf-8").startswith(f"# {section}\n")
+
+
+def slug(heading: str) -> str:
+    """Return the anchor of a heading."""
+    return re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-")
 
 
 def menu(text: str, folder: Path) -> str:

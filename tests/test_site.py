@@ -52,17 +52,13 @@ def test_a_group_of_the_menu_lists_its_pages_as_cards_and_in_the_tree():
     assert "- [" not in shown
 
 
-def slug(heading: str) -> str:
-    return re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-")
-
-
 def test_questions_lead_to_sections():
     links = re.findall(r"^- \[.*\?\]\(([^)]+)\)$", QUESTIONS.read_text(), re.M)
     assert len(links) >= 80
     for link in links:
         page, _, section = link.partition("#")
         headings = re.findall(r"^#+ (.*)$", pages.FENCE.sub("", (DOCS / page).read_text()), re.M)
-        assert not section or section in map(slug, headings), link
+        assert not section or section in map(pages.slug, headings), link
 
 
 @pytest.mark.parametrize(
@@ -122,6 +118,17 @@ def test_every_name_has_an_example():
     without = [name for found in groups if not found[4] for name, _ in reference.DIRECTIVE.findall(found[1])]
     assert without == []
     assert max(len(line) for found in groups for line in found[4].splitlines()) <= 88
+
+
+def test_an_entry_leads_to_where_its_name_is_used():
+    """Each group of names has a how-to; errors have their page."""
+    unused = []
+    for page in (DOCS / "reference").glob("*.md"):
+        for found in pages.GROUP.finditer(page.read_text()) if page.name != "errors.md" else ():
+            names = [name.rpartition(".")[2] for name, _ in reference.DIRECTIVE.findall(found[1])]
+            unused += [] if any(map(pages.used, names)) else [names]
+    assert unused == []
+    assert pages.used("workspace") == "\n**Used in** [Limits and branches](../how-to/kinematics.md#limits-and-branches).\n"
 
 
 def test_names_that_stand_together_share_an_example():
