@@ -16,6 +16,7 @@ UNIT = rf"(?:\.\.\.|{ATOM}(?:\({INNER}\))?|{GROUP})(?:{SUPERSCRIPT}|(?<=\))_\w+)
 EXPRESSION = re.compile(rf"(?<![\w/^.`])-?{UNIT}(?: ?(?:<=|>=|<-|[=+\-/<>]) ?-?{UNIT}| {UNIT})*")
 MEASURE = re.compile(r"[kgmsNJ\d^/() .+-]+")  # nothing but units, as in m/s^2
 NAMED = re.compile(rf"\^|(?<!\w)(?:{'|'.join(GREEK)})(?!\w*[a-z]{{3}})")
+LONG = 80  # letters of an equation in LaTeX, from which it has terms that may stand on several lines
 DISPLAY = re.compile(r"\n\n((?: {4}.*(?:\n|\Z))+)")
 
 
@@ -79,7 +80,7 @@ def mathml(text: str, display: bool = False) -> str:
     """Return an equation in LaTeX as an element of HTML."""
     from latex2mathml.converter import convert
 
-    return convert(text, display="block" if display else "inline")
+    return convert(text, display="block" if display else "inline").replace(r"\_", "_")  # it leaves escapes of words
 
 
 def visit_math(self: Any, node: Any) -> None:
@@ -95,5 +96,18 @@ def visit_display(self: Any, node: Any) -> None:
     from docutils.nodes import SkipNode
 
     parts = re.split(r"\s*\\qquad\s*", node.astext().strip())  # each may stand on a line of its own, where there is little room
-    self.body.append(f'<div class="equation">{" ".join(mathml(part, display=True) for part in parts)}</div>')
+    shown = (" ".join(mathml(term, display=True) for term in terms(part)) for part in parts)
+    self.body.append(f'<div class="equation">{" ".join(f"<div>{each}</div>" for each in shown)}</div>')
     raise SkipNode
+
+
+def terms(text: str) -> list[str]:
+    """Return the terms of a long equation, between which a line may end; others as a whole."""
+    if len(text) < LONG or r"\begin" in text:
+        return [text]
+    found, depth = [""], 0
+    for part in re.split(r"( \+ |[(){}])", text):
+        depth += (part in ("(", "{")) - (part in (")", "}"))
+        found += ["+ "] if part == " + " and depth == 0 else []
+        found[-1] += "" if part == " + " and depth == 0 else part
+    return found

@@ -187,6 +187,13 @@ def test_equations_of_docstrings_are_typeset(said, shown):
     )
 
 
+def test_a_long_equation_may_end_its_lines_between_terms():
+    short, long = "a = b + c", r"a = (b + c) + \frac{d + e}{f} + " + "g" * 80
+    assert mathml.terms(short) == [short]
+    assert mathml.terms(long) == ["a = (b + c)", r"+ \frac{d + e}{f}", "+ " + "g" * 80]
+    assert r"\_" not in mathml.mathml(r"\text{static\_coefficient}")
+
+
 def test_units_and_code_of_docstrings_are_no_equations():
     said = "A rate (m/s^2) of `Psi_q a = gamma` in N m, a motion of I and 5 kg m^2."
     assert mathml.typeset(said) == said

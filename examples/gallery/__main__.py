@@ -63,6 +63,7 @@ THUMBNAIL = {"width": 260, "fps": 10.0}  # a film beside the short title
 LOOP = 2.4  # s, its length
 MOMENT = 0.3  # fraction of the motion at which its picture is taken
 PLACE = '<div id="player"></div>'  # of a player in its page
+ALONE = '<script>if (self !== top) document.getElementById("bar").remove();</script>\n'  # not in the frame of another page
 BAR = """<style>
 body { display: flex; flex-direction: column; height: 100vh; height: 100dvh; }
 #player { flex: 1; min-height: 0; --player-height: 100%; }
@@ -138,7 +139,7 @@ def with_bar(text: str, name: str) -> str:
     short, tried = next(members[name] for members in GROUPS.values() if name in members)
     section = re.sub(r"[^\w\- ]", "", short.lower()).replace(" ", "-")
     back = f'<a href="index.html#{section}">Gallery</a>'
-    bar = f'<p id="bar">{back} &middot; <b>Try:</b> {html.escape(tried)} &middot; <code>{source(name)}</code></p>\n'
+    bar = f'<p id="bar">{back} &middot; <b>Try:</b> {html.escape(tried)} &middot; <code>{source(name)}</code></p>\n{ALONE}'
     return text.replace(PLACE, f"{BAR}{bar}{PLACE}", 1)
 
 
