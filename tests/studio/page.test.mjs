@@ -6,7 +6,7 @@ import {test} from "node:test";
 const page = name => import(`${process.env.STUDIO_PAGE}/${name}.js`);
 const d = await page("document"), actions = await page("actions"), {History} = await page("history"), units = await page("units");
 const {valueText, readValue} = await page("values"), view = await page("view"), picking = await page("picking"), shapes = await page("shapes");
-const forms = await page("pin_forms"), joining = await page("joining"), {evaluate} = await page("expressions");
+const clipboard = await page("clipboard"), forms = await page("pin_forms"), joining = await page("joining"), {evaluate} = await page("expressions");
 const {withBar} = await page("dimensions"), {shapeProblem} = await page("checks"), cams = await page("cam_fields");
 const {symbolsOf} = await page("drawn_symbols"), {motionsOf, carry} = await page("motions"), {stateAt} = await page("player/motion"), {TOOLS} = await page("tools");
 
@@ -94,7 +94,7 @@ test("pins keep their places when those that they refer to go", () => {
 test("a senseless action is a problem in words", () => {
   const found = fourBar();
   for (const result of [actions.drawLink(found, at(0, 0, "A"), at(0, 0, "A"), context), actions.drawLink(found, at(0, 0, "A"), at(0, 0, "B"), context),
-    actions.drawMotor(found, at(0.5, 0.5)), actions.drawGround(found, at(0.5, 0.5)), actions.drawSlide(found, at(1, 1), at(2, 1), context), actions.drawSlot(found, at(1, 1), at(2, 1)),
+    actions.drawMotor(found, at(0.5, 0.5)), actions.drawSlide(found, at(1, 1), at(2, 1), context), actions.drawSlot(found, at(1, 1), at(2, 1)),
     actions.drawGear(found, at(0, 0, null, 0), at(0, 0, null, 0)), actions.drawCam(found, at(0, 0, "A"), at(1, 1)), actions.drawLoad(found, at(1, 1), at(2, 1), context),
     actions.drawSpring(found, at(0, 0, "A"), at(0.03, 0.04, "B")), actions.drawPlate(found, [at(0, 0), at(1, 1), at(2, 2)], context)]) {
     assert.equal(typeof result.problem, "string");
@@ -238,11 +238,73 @@ test("pins between the ends of a bar stay on it", () => {
   assert.ok(folded[1] > 40 && folded[1] < 50);
 });
 
+/** Copies of some items, (dx, dy) metres away: what a duplicate and a paste into another drawing add. */
+const copied = (document, items, to = document) => clipboard.withFragment(to, JSON.parse(JSON.stringify(clipboard.fragmentOf(document, items))), 0.01, -0.01);
+const all = document => [...Object.keys(document.pins).map(name => ({kind: "pin", name})), ...d.LISTS.flatMap(kind => d.list(document, kind).map((_, index) => ({kind, index})))];
+
 test("copies have pins of their own", () => {
-  const [found, copies] = d.duplicate(fourBar(), [{kind: "link", index: 0}, {kind: "link", index: 1}], 0.01, -0.01);
-  assert.deepEqual(copies.map(({index}) => found.link[index].pins), [["E", "F"], ["F", "G"]]);
+  const {document: found, select} = copied(fourBar(), [{kind: "link", index: 0}, {kind: "link", index: 1}]);
+  assert.deepEqual(select.filter(({kind}) => kind === "link").map(({index}) => found.link[index].pins), [["E", "F"], ["F", "G"]]);
   assert.deepEqual(found.pins.F, [40, 30]);
   assert.deepEqual(found.ground, ["A", "D", "E"]);
+});
+
+test("a whole drawing is copied with its motor, its forms and its numbers", () => {
+  const before = freeze({...byLengths(), numbers: {r: 40, s: "2*r"}, pins: {...byLengths().pins, B: {from: "A", length: "r", angle: 60}, D: ["s + 20", 0]}});
+  for (const to of [before, freeze(d.EMPTY)]) {
+    const {document: found, select, note} = copied(before, all(before), to), added = Object.keys(found.pins).length - Object.keys(to.pins).length;
+    assert.equal(note, "");
+    assert.equal(added, 6);
+    assert.equal(select.length, 6 + 3 + 1);
+    assert.deepEqual(found.numbers, before.numbers);
+    const motor = found.motor.at(-1), [crank, coupler] = found.link.slice(-3);
+    assert.deepEqual(motor.pin, crank.pins[0]);
+    const length = ({pins: [a, b]}) => Math.hypot(...[0, 1].map(k => d.placeOf(found, a)[k] - d.placeOf(found, b)[k]));
+    near([1000 * length(crank), 1000 * length(coupler)], [40, 120]);
+    assert.deepEqual(found.pins[crank.pins[1]], {from: crank.pins[0], length: "r", angle: 60});
+    near(d.placeOf(found, motor.pin), [0.01, -0.01]);
+    assert.equal(shapeProblem(found), "");
+  }
+});
+
+test("what a copy names is taken from the drawing, or it is left out and named", () => {
+  const before = fourBar(), inches = freeze({...d.EMPTY, units: {length: "in", angle: "deg"}, pins: {X: [0, 0]}});
+  const motor = [{kind: "motor", index: 0}];
+  assert.equal(copied(before, motor).document.motor.length, 2);
+  assert.match(copied(before, motor, freeze({...d.EMPTY, pins: {X: [0, 0]}})).note, /^motor1 is left out: A is not in this drawing/);
+  assert.match(copied(before, motor, inches).problem, /other units/);
+  const r = freeze({...before, numbers: {r: 40}, pins: {...before.pins, B: {from: "A", length: "r", angle: 60}}});
+  assert.equal(copied(r, all(r), freeze({...before, numbers: {r: 30}})).note, "r stays 30");
+});
+
+test("an area holds the elements whose pins and links it holds", () => {
+  const found = fourBar(), places = new Map(Object.keys(found.pins).map(name => [name, d.placeOf(found, name)]));
+  const kinds = area => picking.itemsWithin(found, places, ...area).map(({kind, index, name}) => `${kind} ${name ?? index}`).sort();
+  assert.deepEqual(kinds([[-1, -1], [0.05, 1]]), ["link 0", "motor 0", "pin A", "pin B"]);
+  assert.equal(kinds([[-1, -1], [1, 1]]).length, 4 + 3 + 1);
+});
+
+test("a motor moves a slide by its rail or its link, or, between two pins, a cylinder", () => {
+  const slider = freeze(actions.drawSlide(fourBar(), at(0.12, 0.09, "C"), at(0.2, 0.09), context).document), rail = {...at(0.2, 0.09), slide: 0};
+  const found = freeze(actions.drawMotor(slider, rail).document);
+  assert.deepEqual(found.motor.at(-1), {slide: "slide1", speed: "0.1 m/s"});
+  assert.deepEqual(actions.drawMotor(found, rail).select, [{kind: "motor", index: 1}]);
+  assert.deepEqual(actions.drawMotor(slider, at(0.12, 0.09, null, 3)).document.motor.at(-1), {slide: "slide1", speed: "0.1 m/s"});
+  const cylinder = actions.drawCylinder(fourBar(), at(0, 0, "A"), at(0.12, 0.09, "C")).document.motor.at(-1);
+  assert.deepEqual(cylinder, {between: ["A", "C"], speed: "0.1 m/s"});
+  const fresh = actions.drawCylinder(fourBar(), at(0.05, 0), at(0.12, 0.09, "C")).document;
+  assert.deepEqual([fresh.motor.at(-1).between, fresh.ground], [["E", "C"], ["A", "D", "E"]]);
+  assert.match(actions.drawCylinder(fourBar(), at(0, 0, "A"), at(0.03, 0.04, "B")).problem, /both ends are on link1/);
+});
+
+test("ground and cam make the pins that they need, and a motor at a slot says what to do", () => {
+  const grounded = actions.drawGround(fourBar(), at(0.2, 0)).document;
+  assert.deepEqual([grounded.pins.E, grounded.ground], [[200, 0], ["A", "D", "E"]]);
+  const lever = actions.drawLink(d.EMPTY, at(0, 0.1), at(0.1, 0.1), context).document, disc = actions.drawDisc(lever, at(0.05, 0.05), at(0.06, 0.05), context).document;
+  const cam = actions.drawCam(disc, at(0.05, 0.05, "C"), at(0.07, 0.1, null, 0)).document;
+  assert.deepEqual([cam.cam[0].pins, cam.link[0].pins, cam.pins.D], [["C", "D"], ["A", "D", "B"], [70, 100]]);
+  const slot = actions.drawSlot(actions.drawLink(d.EMPTY, at(0, 0), at(0.1, 0), context).document, at(0.1, 0, "B"), at(0.2, 0)).document;
+  assert.match(actions.drawMotor(slot, at(0.1, 0, "B")).problem, /replace the slot by a slide/);
 });
 
 test("undo and redo restore the very states, and an equal state adds no step", () => {

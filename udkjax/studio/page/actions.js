@@ -1,6 +1,6 @@
 // Actions of the drawing tools: each takes a document and targets, and returns {document, select} or {problem}.
 //
-// A target is the beginning or the end of a gesture: {place} in metres, with the `pin` or the `link` (its index) under it.
+// A target is the beginning or the end of a gesture: {place} in metres, with the `pin`, or the `link` and the `slide` (indices), under it.
 
 import {addPin, freshName, groundOf, list, members, nameOf, placeOf, project, movePin, withElement, withEntry, toggleGround} from "./document.js";
 import {addPinToLink} from "./joining.js";
@@ -62,40 +62,43 @@ export function drawDisc(document, from, to, {size}) {
   return {document: made, select: [last(made, "link")]};
 }
 
-export function drawGround(document, {pin, link, place}) {
-  if (pin === undefined || pin === null) {
-    if (link === undefined || link === null) return {problem: "click a pin to fix it to the ground, or to free it"};
-    const [found, name] = addPinToLink(document, link, place);
-    return {document: toggleGround(found, name), select: [{kind: "pin", name}]};
-  }
-  return {document: toggleGround(document, pin), select: [{kind: "pin", name: pin}]};
+/** Fix a pin to the ground, or free it; where there is none, a new one is fixed, on the link that is there. */
+export function drawGround(document, target) {
+  const [found, name] = pinFor(document, target);
+  return {document: toggleGround(found, name), select: [{kind: "pin", name}]};
 }
 
 /** The two members between which an element at a pin acts, as `of`; a problem if there are fewer than two. */
 function pairAt(document, pin, what) {
-  const met = members(document, pin);
+  const met = members(document, pin), slot = list(document, "slot").findIndex(entry => entry.pin === pin);
+  if (met.length < 2 && slot >= 0) return {problem: `only ${nameOf(document, "slot", slot)} holds ${pin}: to drive it along the line, replace the slot by a slide (S)`};
   if (met.length < 2) {
     return {problem: `${what} acts between two links, or between a link and the ground, but ${met.length ? `only ${met[0]}` : "nothing"} is at ${pin}: fix the pin to the ground (G)`};
   }
   return met.length > 2 ? {of: met.slice(0, 2)} : {};
 }
 
-export function drawMotor(document, {pin, link, place}) {
-  const slide = list(document, "slide").findIndex(entry => entry.link === list(document, "link")[link]?.name);
-  const blocked = pin && list(document, "slide").findIndex(e => list(document, "link").find(l => l.name === e.link)?.pins?.[0] === pin && members(document, pin).length < 2);
-  const moved = slide >= 0 ? slide : blocked >= 0 && blocked !== null && pin ? blocked : -1;
-  if (moved >= 0) {
-    const made = withElement(document, "motor", {slide: nameOf(document, "slide", moved), speed: "0.1 m/s"});
-    return {document: made, select: [last(made, "motor")]};
-  }
-  if (!pin) return {problem: "a motor turns a link at a pin, or moves a slide: click one of these"};
-  const present = list(document, "motor").findIndex(motor => motor.pin === pin);
+/** The slide of a link, or of a pin that is alone on its link and whose only member that is; -1 if there is none. */
+function slideAt(document, {pin, link, slide}) {
+  const alone = pin && members(document, pin).length < 2 ? list(document, "link").find(one => one.pins?.length === 1 && one.pins[0] === pin) : null;
+  const guided = (alone ?? list(document, "link")[link])?.name, found = list(document, "slide").findIndex(entry => guided && entry.link === guided);
+  return found >= 0 ? found : pin ? -1 : slide ?? -1;
+}
+
+/** A motor at a pin or a slide; a click on one that is there selects it. */
+export function drawMotor(document, target) {
+  const {pin, place} = target, slide = slideAt(document, target), name = slide >= 0 ? nameOf(document, "slide", slide) : null;
+  if (name === null && !pin) return {problem: "a motor turns a link at a pin, or moves a slide: click one of these, or drag from pin to pin for a cylinder"};
+  const present = list(document, "motor").findIndex(motor => (name === null ? motor.pin === pin : motor.slide === name));
   if (present >= 0) return {document, select: [{kind: "motor", index: present}]};
-  const pair = pairAt(document, pin, "a motor");
+  const pair = name === null ? pairAt(document, pin, "a motor") : {};
   if (pair.problem) return pair;
-  const made = withElement(document, "motor", {pin, speed: "60 rpm", ...pair});
+  const made = withElement(document, "motor", name === null ? {pin, speed: "60 rpm", ...pair} : {slide: name, speed: "0.1 m/s"});
   return {document: made, select: [last(made, "motor")], place};
 }
+
+/** A cylinder: a motor that changes the distance between two pins. */
+export const drawCylinder = (document, from, to) => drawBetween(document, from, to, "motor", {speed: "0.1 m/s"}, {speed: "60 rpm"});
 
 const vector = angle => [Math.cos(angle), Math.sin(angle)].map(x => tidy(Math.round(x * 1e9) / 1e9));
 const directionOf = (from, to) => {
@@ -164,7 +167,11 @@ function wheelAt(document, pin) {
 export function drawCam(document, from, to) {
   const links = list(document, "link");
   const centre = from.pin ?? (links[from.link]?.pins.length === 1 ? links[from.link].pins[0] : undefined);
-  if (!centre || !to.pin || centre === to.pin) return {problem: "a cam turns about one pin and lifts another: drag from its centre to the follower's pin"};
+  if (!to.pin && links[to.link] && to.link !== from.link) {  // a pin of the follower, where the drag ends
+    const [made, pin] = addPinToLink(document, to.link, to.place);
+    return drawCam(made, from, {...to, pin});
+  }
+  if (!centre || !to.pin || centre === to.pin) return {problem: "a cam turns about one pin and lifts another: drag from its centre to the follower, or its pin"};
   const cam = wheelAt(document, centre), follower = members(document, to.pin).filter(name => name !== "ground");
   if (!cam) return {problem: `the cam needs a link of its own at ${centre}: draw a disc there (B)`};
   if (!follower.length || follower.includes(cam)) return {problem: `${to.pin} must be a pin of the follower, not of the cam`};
@@ -182,10 +189,10 @@ export function drawCam(document, from, to) {
   return {document: made, select: [last(made, "cam")]};
 }
 
-/** A spring or a damper between two pins, or a torsional one at a single pin. New pins are fixed to the ground. */
+/** A spring, a damper or a cylinder between two pins, or a torsional one at a single pin. New pins are fixed to the ground. */
 function drawBetween(document, from, to, kind, law, turning) {
   if (from.pin && (to.pin === from.pin || to.isClick)) {
-    const pair = pairAt(document, from.pin, `a torsion ${kind}`);
+    const pair = pairAt(document, from.pin, kind === "motor" ? "a motor" : `a torsion ${kind}`);
     if (pair.problem) return pair;
     const made = withElement(document, kind, {pin: from.pin, ...pair, ...turning});
     return {document: made, select: [last(made, kind)]};
@@ -198,7 +205,7 @@ function drawBetween(document, from, to, kind, law, turning) {
     if (isNew) found = toggleGround(found, pin);
     between.push(pin);
   }
-  if (between[0] === between[1] || !isApart(found, ...between)) return {problem: `a ${kind} needs two pins: drag from one point to another`};
+  if (between[0] === between[1] || !isApart(found, ...between)) return {problem: `a ${kind === "motor" ? "cylinder" : kind} needs two pins: drag from one point to another`};
   const shared = members(found, between[0]).filter(name => members(found, between[1]).includes(name));
   if (shared.length) return {problem: `both ends are on ${shared[0]}: their distance never changes`};
   found = withElement(found, kind, {between, ...law});

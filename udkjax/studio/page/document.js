@@ -7,6 +7,7 @@ import {length, written} from "./units.js";
 export const LISTS = ["link", "slide", "slot", "gear", "screw", "cam", "motor", "spring", "damper", "load", "body", "joint", "driver", "force"];
 // Keys of tables that name pins and links.
 const PIN_KEYS = ["pin", "pins", "along", "between"], LINK_KEYS = ["link", "on", "links", "of", "carrier", "bodies", "body"];
+export const NAME_KEYS = [...PIN_KEYS, ...LINK_KEYS, "slide"];
 const GROUND = "ground";
 const THICKNESS = 0.005;  // m, of a link that gets a density
 const OFF_LINE = 1e-9;  // fraction of a line's length: a pin closer to the line lies on it
@@ -21,6 +22,9 @@ export const placeOf = (document, pin) => placesOf(document)[pin] ?? null;
 
 /** The name of an element: its own, or the section's with its number. */
 export const nameOf = (document, section, index) => list(document, section)[index]?.name ?? `${section}${index + 1}`;
+
+/** The names of pins and elements that an entry refers to. */
+export const namesOf = entry => NAME_KEYS.flatMap(key => [entry[key]].flat()).filter(name => typeof name === "string");
 
 /** The document with a section replaced; an empty section is left out. */
 function withSection(document, section, entries) {
@@ -252,28 +256,8 @@ export function pinsOfItems(document, items) {
     : item.kind === "link" ? list(document, "link")[item.index]?.pins ?? [] : [])))];
 }
 
-/** The document with copies of links and their pins, (dx, dy) metres away; and the copies. */
-export function duplicate(document, items, dx, dy) {
-  const links = items.filter(item => item.kind === "link").map(item => item.index);
-  let found = document;
-  const copies = new Map();
-  for (const pin of pinsOfItems(document, items.filter(item => item.kind === "link"))) {
-    const place = placeOf(document, pin);
-    const [next, name] = addPin(found, place ? [place[0] + dx, place[1] + dy] : [0, 0]);
-    found = groundOf(document).includes(pin) ? toggleGround(next, name) : next;
-    copies.set(pin, name);
-  }
-  const made = [];
-  for (const index of links) {
-    const {name, ...link} = list(document, "link")[index];
-    const shifted = Object.fromEntries(["centre", "outline"].filter(key => key in link).map(key => [key, shiftedPoints(link[key], document, dx, dy)]));
-    found = withElement(found, "link", {name: freshName(found, "link"), ...link, ...shifted, pins: link.pins.map(pin => copies.get(pin))});
-    made.push({kind: "link", index: list(found, "link").length - 1});
-  }
-  return [found, made];
-}
-
-function shiftedPoints(value, document, dx, dy) {
+/** Points (pairs in the drawing's units) of an element, (dx, dy) metres away. */
+export function shiftedPoints(value, document, dx, dy) {
   if (Array.isArray(value[0])) return value.map(p => shiftedPoints(p, document, dx, dy));
   return value.map((x, k) => written(length(x, document) + (k ? dy : dx), document, x));
 }

@@ -31,14 +31,14 @@ export class Gestures {
     return [event.clientX - box.left, event.clientY - box.top];
   }
 
-  /** The position of a pointer, and the pin or link under it. */
+  /** The position of a pointer, and the pin, link or slide under it. */
   target(event, except = null) {
     const {studio} = this, pixel = this.pixel(event), touch = event.pointerType === "touch";
     const pin = pinAt(studio.canvas.places, pixel, touch, except);
-    const found = pin === null ? itemAt(studio.canvas.outlines, studio.canvas.places, pixel, touch, ["link"]) : null;
+    const under = kind => (pin === null ? itemAt(studio.canvas.outlines, studio.canvas.places, pixel, touch, [kind]) : null), found = under("link");
     const free = toMetres(studio.view, pixel), mark = found && !event.altKey ? snapOnLink(studio.document, found.index, free, SNAP / studio.view.scale) : null;
     const place = pin === null ? mark ?? studio.snap(free, event) : placeOf(studio.document, pin);
-    return {pixel, pin, link: found?.index ?? null, place, free};
+    return {pixel, pin, link: found?.index ?? null, slide: under("slide")?.index ?? null, place, free};
   }
 
   down(event) {
@@ -87,8 +87,9 @@ export class Gestures {
       const has = studio.selection.some(other => same(other, item));
       studio.select(has ? studio.selection.filter(other => !same(other, item)) : [...studio.selection, item]);
     } else if (!studio.selection.some(other => same(other, item))) studio.select([item]);
+    const isAmong = studio.selection.length > 1 && !event.shiftKey && !event.ctrlKey && !event.metaKey;  // a click selects it alone, a drag moves all
     const pins = pinsOfItems(studio.document, studio.selection);
-    this.now = {kind: "drag", item, pins, before: studio.document, start: toMetres(studio.view, pixel)};
+    this.now = {kind: "drag", item, isAmong, pins, before: studio.document, start: toMetres(studio.view, pixel)};
   }
 
   move(event) {
@@ -155,6 +156,7 @@ export class Gestures {
     else if (now.kind === "area" && this.moved) studio.select(itemsWithin(studio.document, studio.canvas.places, this.from, this.pixel(event)));
     else if (now.kind === "pull") this.letGo(now);
     else if (now.kind === "drag" && this.moved) this.drop(now);
+    else if (now.kind === "drag" && now.isAmong) studio.select([now.item]);
     else if (now.kind === "draw") this.release(now, this.target(event));
     studio.redraw();
   }
@@ -184,6 +186,7 @@ export class Gestures {
     if (tool.kind === "click") return studio.apply(tool.make(studio.document, target, context));
     if (tool.kind === "corners") return this.corner(tool, target, context);
     if (this.moved && !this.start) return studio.apply(tool.make(studio.document, target, end, context));
+    if (!this.start && tool.click) return studio.apply(tool.click(studio.document, target, context));
     if (!this.start) {
       this.start = target;
       studio.preview = {from: target, to: target};

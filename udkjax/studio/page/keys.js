@@ -1,13 +1,14 @@
 // Keyboard shortcuts, as in other drawing programs.
 
-import {duplicate, pinsOfItems, removeElements, settle, shiftPins} from "./document.js";
+import {copy, followClipboard} from "./clipboard.js";
+import {LISTS, list, pinsOfItems, pinsOf, removeElements, settle, shiftPins} from "./document.js";
 import {TOOLS} from "./tools.js";
 
 const TIME_STEPS = 100;  // presses of an arrow key through a whole run
-const COPY_PIXELS = 24;  // between the original and its copy
 const typing = target => ["INPUT", "TEXTAREA", "SELECT"].includes(target.tagName) && target.type !== "range" && target.type !== "checkbox";
 
 export function followKeys(studio) {
+  followClipboard(studio, typing, remove);
   window.addEventListener("keydown", event => {
     const key = event.key.length === 1 ? event.key.toLowerCase() : event.key, command = event.ctrlKey || event.metaKey;
     const isNew = event.altKey && event.code === "KeyN";  // for browsers that keep Ctrl+N to themselves
@@ -27,7 +28,7 @@ const commands = (studio, event) => ({
   n: () => studio.files.startNew(),
   o: () => studio.files.showOpen(),
   d: () => copy(studio),
-  a: () => studio.select(Object.keys(studio.document.pins ?? {}).map(name => ({kind: "pin", name}))),
+  a: () => studio.select(everything(studio.document)),
 });
 
 const plain = studio => ({
@@ -55,14 +56,10 @@ function nudge(studio, x, y) {
   return studio.motion.seek(studio.motion.t + (x || y) * studio.motion.end / TIME_STEPS);
 }
 
+/** All pins and elements of a drawing. */
+const everything = document => [...Object.keys(pinsOf(document)).map(name => ({kind: "pin", name})),
+  ...LISTS.flatMap(kind => list(document, kind).map((_, index) => ({kind, index})))];
+
 export function remove(studio) {
   if (studio.selection.length) studio.commit(removeElements(studio.document, studio.selection), []);
-}
-
-export function copy(studio) {
-  const away = COPY_PIXELS / studio.view.scale, [dx, dy] = studio.snap([away, -away], {altKey: false});
-  const links = studio.selection.filter(item => item.kind === "link");
-  if (!links.length) return studio.say("select a link to duplicate it");
-  const [found, copies] = duplicate(studio.document, links, dx || away, dy || -away);
-  return studio.commit(found, copies);
 }

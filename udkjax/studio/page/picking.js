@@ -1,6 +1,6 @@
 // The item under the cursor: the nearest pin, or else the topmost symbol near the cursor.
 
-import {list} from "./document.js";
+import {LISTS, list, nameOf, namesOf} from "./document.js";
 import {isNear} from "./player/symbols.js";
 
 const PIN_REACH = 11, SYMBOL_REACH = 7, TOUCH = 1.8;  // px; and the factor by which fingers reach farther
@@ -36,8 +36,16 @@ export function itemAt(outlines, places, pixel, touch = false, kinds = null) {
 export function itemsWithin(document, places, [x0, y0], [x1, y1]) {
   const holds = ([x, y]) => x >= Math.min(x0, x1) && x <= Math.max(x0, x1) && y >= Math.min(y0, y1) && y <= Math.max(y0, y1);
   const pins = new Set([...places].filter(([, place]) => holds(place)).map(([name]) => name));
-  const links = list(document, "link").flatMap((link, index) => (link.pins?.every(pin => pins.has(pin)) ? [{kind: "link", index}] : []));
-  return [...links, ...[...pins].map(name => ({kind: "pin", name}))];
+  const found = [], names = new Set(["ground", ...pins]);
+  for (const kind of LISTS) {  // in an order in which each kind names pins and earlier kinds
+    list(document, kind).forEach((entry, index) => {
+      const named = namesOf(entry);
+      if (!named.length || !named.every(name => names.has(name))) return;
+      found.push({kind, index});
+      names.add(nameOf(document, kind, index));
+    });
+  }
+  return [...found, ...[...pins].map(name => ({kind: "pin", name}))];
 }
 
 /** True if two items are the same. */

@@ -3,7 +3,8 @@
 import {groundOf, list, movePin, nameOf, pinsOf, placeOf, renameElement, renamePin, toggleGround, withKey, withValue} from "./document.js";
 import {readValue, valueText} from "./values.js";
 import {shapeProblem} from "./checks.js";
-import {copy, remove} from "./keys.js";
+import {copy} from "./clipboard.js";
+import {remove} from "./keys.js";
 import {lengthOf, withBar, withLengthText} from "./dimensions.js";
 import {numberFields} from "./number_fields.js";
 import {swapPair} from "./actions.js";
@@ -64,8 +65,7 @@ export class PropertiesPanel {
     if (!item) return this.element.replaceChildren(...this.general());
     const parts = more.length ? [make("p", {}, `${1 + more.length} selected`)] : item.kind === "pin" ? this.pin(item.name) : this.entry(item);
     const buttons = [make("button", {type: "button", onclick: () => remove(studio)}, "Delete")];
-    if (studio.selection.some(one => one.kind === "link")) buttons.push(make("button", {type: "button", onclick: () => copy(studio)}, "Duplicate"));
-    return this.element.replaceChildren(...parts, make("div", {class: "group"}, ...buttons));
+    return this.element.replaceChildren(...parts, make("div", {class: "group"}, ...buttons, make("button", {type: "button", onclick: () => copy(studio)}, "Duplicate")));
   }
 
   /** A field for a value; `take` gets the text when editing ends. */
