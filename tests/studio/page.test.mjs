@@ -7,7 +7,7 @@ const page = name => import(`${process.env.STUDIO_PAGE}/${name}.js`);
 const d = await page("document"), actions = await page("actions"), {History} = await page("history"), units = await page("units");
 const {valueText, readValue} = await page("values"), view = await page("view"), picking = await page("picking"), shapes = await page("shapes");
 const clipboard = await page("clipboard"), forms = await page("pin_forms"), joining = await page("joining"), {evaluate} = await page("expressions");
-const {withBar} = await page("dimensions"), {shapeProblem} = await page("checks"), cams = await page("cam_fields");
+const {withBar} = await page("dimensions"), {marksOf} = await page("dimension_marks"), {shapeProblem} = await page("checks"), cams = await page("cam_fields");
 const {symbolsOf} = await page("drawn_symbols"), {motionsOf, carry} = await page("motions"), {stateAt} = await page("player/motion"), {TOOLS} = await page("tools");
 
 const context = {size: 0.01, scale: 1000};
@@ -305,6 +305,45 @@ test("ground and cam make the pins that they need, and a motor at a slot says wh
   assert.deepEqual([cam.cam[0].pins, cam.link[0].pins, cam.pins.D], [["C", "D"], ["A", "D", "B"], [70, 100]]);
   const slot = actions.drawSlot(actions.drawLink(d.EMPTY, at(0, 0), at(0.1, 0), context).document, at(0.1, 0, "B"), at(0.2, 0)).document;
   assert.match(actions.drawMotor(slot, at(0.1, 0, "B")).problem, /replace the slot by a slide/);
+});
+
+/** Drawings whose pins are given in each of the ways in which dimensions are. */
+function dimensioned() {
+  const plate = freeze({...byLengths(), link: byLengths().link.map(({width, ...link}) => link)});
+  const slider = freeze({...d.EMPTY, ground: ["A"], pins: {A: [0, 0], B: {from: "A", length: 50, angle: 60}, C: [160, -20]}, motor: [{pin: "A", speed: "60 rpm"}],
+    link: [{name: "crank", pins: ["A", "B"]}, {name: "rod", pins: ["B", "C"]}, {name: "slider", pins: ["C"]}], slide: [{name: "rail", link: "slider", direction: 0}]});
+  const named = freeze({...plate, numbers: {r: 40}, pins: {...plate.pins, B: {from: "A", length: "r", angle: "1.5*r"}, D: ["2.5*r", 12]}});
+  return [fourBar(), plate, named, slider];
+}
+
+test("a dimension takes what is typed, and the other ones stay or are named", () => {
+  const valueOf = words => parseFloat(words.split("= ").at(-1));
+  const count = dimensioned().map(document => {
+    const marks = marksOf(document), values = new Map(marks.map(({key, words}) => [key, valueOf(words)]));
+    for (const {key, words, typed, take} of marks) {
+      const wanted = 1.02 * values.get(key), {document: found, note, problem} = take(String(wanted));
+      assert.equal(problem, undefined, `${key} ${words}`);
+      assert.equal(document, freeze(document));
+      for (const other of marksOf(found)) {
+        const now = valueOf(other.words), before = other.key === key ? wanted : values.get(other.key);
+        const isNamed = note.includes(other.key.split(" ")[1]);
+        assert.ok(Math.abs(now - before) < 1e-5 * Math.abs(before) || (other.key !== key && isNamed), `${key}: ${other.key} is ${now}, not ${before}; ${note}`);
+      }
+      assert.match(take("no number").problem, /is not an? (length|angle)/, key);
+      assert.ok(typed.length > 0);
+    }
+    return marks.length;
+  });
+  assert.deepEqual(count, [4, 7, 8, 4]);
+});
+
+test("an expression of named numbers that is typed as a dimension stays", () => {
+  const [, , named] = dimensioned(), mark = key => marksOf(named).find(one => one.key === key);
+  assert.deepEqual(["link link1", "angle B", "support D 0", "support D 1"].map(key => mark(key).words), ["r = 40", "1.5*r = 60°", "2.5*r = 100", "12"]);
+  assert.equal(mark("link link1").take("r + 2").document.pins.B.length, "r + 2");
+  assert.equal(mark("support D 0").take("3*r").document.pins.D[0], "3*r");
+  assert.equal(mark("angle B").take("2*r").document.pins.B.angle, "2*r");
+  assert.equal(mark("support D 1").take("-12").document.pins.D[1], -12);
 });
 
 test("undo and redo restore the very states, and an equal state adds no step", () => {

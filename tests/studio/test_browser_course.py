@@ -1,5 +1,7 @@
 """A course in the studio's page: answers beside the drawing, and expressions of named numbers in fields."""
 
+import tomllib
+
 import numpy as np
 import pytest
 
@@ -72,4 +74,97 @@ def test_answers_and_named_numbers_stand_in_the_panels(studio):
     shown = float(title.split()[1])
     x = studio.js("+document.querySelector('details.answers tbody tr').cells[1].textContent")
     np.testing.assert_allclose(x, 42 * np.cos(np.radians(shown)), atol=1e-3)
+    assert not studio.problems
+
+
+def edit_dimension(studio, words, text):
+    """Click a dimension on the drawing, and type another value in its place."""
+    box, canvas = (
+        studio.js(f"studio.dimensions.boxes.find(({{mark}}) => mark.words === {words!r}).box"),
+        studio.page.locator("main canvas").bounding_box(),
+    )
+    studio.page.mouse.click(canvas["x"] + (box[0] + box[2]) / 2, canvas["y"] + (box[1] + box[3]) / 2)
+    studio.page.keyboard.type(text)
+    studio.page.keyboard.press("Enter")
+    studio.settle()
+
+
+@pytest.mark.slow
+def test_dimensions_on_the_drawing_are_changed_by_a_click(studio):
+    (studio.folder / "dimensions.toml").write_text(FOUR_BAR, encoding="utf-8")
+    studio.js("studio.files.openFile('dimensions.toml')")
+    studio.settle()
+    assert sorted(studio.js("studio.dimensions.marks.map(({words}) => words)")) == [
+        "2.5*r = 100",
+        "3*r = 120",
+        "60°",
+        "80",
+        "r = 40",
+    ]
+    for words, text in (("80", "85"), ("60°", "75"), ("2.5*r = 100", "2.75*r"), ("r = 40", "44 mm")):
+        edit_dimension(studio, words, text)
+    assert studio.document["pins"] == {
+        "O": [0, 0],
+        "C": ["2.75*r", 0],
+        "A": {"from": "O", "length": 44, "angle": 75},
+        "B": {"from": ["A", "C"], "length": ["3*r", 85], "side": "left"},
+    }
+    edit_dimension(studio, "85", "-5")
+    assert "is not a length above 0" in studio.status()
+    studio.page.keyboard.press("Escape")
+    edit_dimension(studio, "85", "500")
+    assert "cannot be 500 mm long: coupler is 120 mm" in studio.status()
+    studio.js("studio.motion.seek(0.25 * studio.motion.end)")
+    studio.settle()
+    assert studio.js("studio.dimensions.boxes.length") == 0  # of the drawn position alone
+    assert not studio.problems
+
+
+@pytest.mark.slow
+def test_a_mechanism_is_copied_by_keys_and_its_copy_moves(studio):
+    (studio.folder / "copied.toml").write_text(FOUR_BAR, encoding="utf-8")
+    studio.js("studio.files.openFile('copied.toml')")
+    studio.settle()
+    studio.page.locator("main canvas").focus()
+    for keys in ("a", "c", "v"):
+        studio.page.keyboard.press(f"Control+{keys}")
+    studio.settle()
+    assert len(studio.document["link"]) == 6
+    assert [motor["pin"] for motor in studio.document["motor"]] == ["O", studio.document["link"][3]["pins"][0]]
+    mechanism = udk.loads(studio.js("studio.state.text"))
+    lengths = mechanism.drawing.length_texts()
+    assert [lengths[link["name"]].split()[-2] for link in studio.document["link"]] == ["40", "120", "80"] * 2
+    studio.page.keyboard.press("Control+x")
+    studio.settle()
+    assert studio.document["link"] == udk_links(FOUR_BAR)
+    x, y = studio.pin("A")
+    studio.page.keyboard.press("Control+a")
+    studio.page.mouse.click(x, y)  # one of several that are selected: it alone
+    assert studio.js("studio.selection") == [{"kind": "pin", "name": "A"}]
+    assert not studio.problems
+
+
+def udk_links(text):
+    return tomllib.loads(text)["link"]
+
+
+@pytest.mark.slow
+def test_motors_move_slides_and_cylinders_by_mouse(studio):
+    studio.tool("g")
+    studio.click(0, 0)
+    studio.link((0, 0), (100, 0))
+    studio.tool("s")
+    studio.drag((100, 0), (150, 0))
+    studio.js("studio.select([])")
+    studio.tool("m")
+    x = studio.js("studio.canvas.outlines.filter(({of}) => of?.kind === 'slide').map(({points}) => points.at(-1))")
+    canvas = studio.page.locator("main canvas").bounding_box()
+    studio.page.mouse.click(canvas["x"] + x[0][0] - 2, canvas["y"] + x[0][1])
+    assert studio.document["motor"] == [{"slide": "slide1", "speed": "0.1 m/s"}]
+    studio.page.keyboard.press("Control+z")
+    studio.tool("m")
+    studio.drag((20, 60), (100, 0))
+    studio.settle()
+    assert studio.document["motor"] == [{"between": ["C", "B"], "speed": "0.1 m/s"}]
+    assert studio.document["ground"] == ["A", "C"]
     assert not studio.problems

@@ -64,6 +64,7 @@ export class DrawingCanvas {
     studio.vectors.draw(painter, theme);
     this.places = this.placesOf(document);
     this.names.begin(painter, this.places.values());
+    studio.dimensions.draw(painter, theme, this.names);
     this.marks(studio, painter, theme);
     this.labels(studio, painter, theme);
     this.preview(studio, painter, theme);

@@ -3,7 +3,7 @@
 
 import {groundOf, list, movePin, nameOf, pinsOf, placeOf, settle} from "./document.js";
 import {referencesOf} from "./pin_forms.js";
-import {direction, lengthName, lengthUnit, written} from "./units.js";
+import {angle, direction, length, lengthName, lengthUnit, readMeasure, usesNumbers, written} from "./units.js";
 
 const SAME = 1e-9;  // relative to a dimension: less is rounding of the numbers that are written
 const cross = (a, b) => a[0] * b[1] - a[1] * b[0], dot = (a, b) => a[0] * b[0] + a[1] * b[1], minus = (a, b) => [a[0] - b[0], a[1] - b[1]];
@@ -84,10 +84,10 @@ function reason(document, link, pin, anchor, size) {
 
 /**
  * The drawing with a bar of another length (m) and angle (rad), with `note`, which dimension has given way, or the `problem`.
- * Of the two pins, the one moves that changes no other dimension; a pin that closes a loop becomes given by two lengths.
+ * Of the two pins, the one moves that changes no other dimension, if it is not `held`; a pin that closes a loop becomes given by two lengths.
  */
-export function withBar(document, link, size, way) {
-  const fixed = groundOf(document), dimensions = dimensionsOf(document, link), turns = Math.abs(way - wayOf(document, link)) > SAME;
+export function withBar(document, link, size, way, held = null) {
+  const fixed = [...groundOf(document), held], dimensions = dimensionsOf(document, link), turns = Math.abs(way - wayOf(document, link)) > SAME;
   const movers = [1, 0].filter(k => !fixed.includes(link.pins[k])), found = [];
   for (const k of movers.length ? movers : [1]) {
     const [pin, anchor] = [link.pins[k], link.pins[1 - k]], from = placeOf(document, anchor), sign = k ? 1 : -1;
@@ -102,6 +102,52 @@ export function withBar(document, link, size, way) {
   if (!best || (best[1].length && why && isHeld(document, link.pins[mover]))) return {problem: why || "other pins that are given by lengths would have no place"};
   const note = best[1].map(({words, measure, isOffset}) => `${words} is now ${numberOf(isOffset ? Math.abs(measure(best[0])) : measure(best[0]), document)}`).join("; ");
   return {document: best[0], note};
+}
+
+const EXAMPLES = {length: "a length above 0: write 12 or 12 mm", angle: "an angle: write 30 or 30 deg"};
+
+/** As `withBar`, for a length or an angle as it was typed: a number, with or without a unit, or an expression of named numbers. */
+export function withTypedBar(document, link, text, quantity) {
+  const read = readMeasure(text, quantity, document), next = {length, angle}[quantity](read, document), isLength = quantity === "length";
+  if (!Number.isFinite(next) || (isLength && !(next > 0))) return {problem: `"${text}" is not ${EXAMPLES[quantity]}`};
+  const found = withBar(document, link, isLength ? next : distance(document, ...link.pins), isLength ? wayOf(document, link) : next);
+  const isNamed = isLength && usesNumbers(read, document) && found.document && lengthOf(found.document, link);
+  return isNamed ? {...found, document: withLengthText(found.document, link, read)} : found;
+}
+
+/** A drawing in which a pin has moved, with the lengths of bars of before, and `note`, which of them had to give way. */
+function withLengths(changed, before, pin) {
+  const size = link => distance(before, ...link.pins), isOther = (document, link) => Math.abs(distance(document, ...link.pins) - size(link)) > SAME * size(link);
+  let found = changed;
+  for (const link of bars(before).filter(one => isOther(changed, one))) {
+    const next = withBar(found, link, size(link), wayOf(found, link), pin);
+    if (!next.problem) found = next.document;
+  }
+  const note = bars(before).filter(one => isOther(found, one)).map(one => `${one.name} is now ${numberOf(distance(found, ...one.pins), found)}`).join("; ");
+  return {document: found, note};
+}
+
+/** The drawing in which one number of a pin, at `keys` of its value, is the typed one. */
+export function withPinNumber(document, name, [key, k], text, quantity) {
+  const read = readMeasure(text, quantity, document), next = {length, angle}[quantity](read, document), value = pinsOf(document)[name];
+  if (!Number.isFinite(next)) return {problem: `"${text}" is not ${EXAMPLES[quantity]}`};
+  const changed = k === undefined ? read : value[key].with(k, read), found = settle(withPin(document, name, Array.isArray(value) ? value.with(key, read) : {...value, [key]: changed}));
+  const lost = Object.keys(pinsOf(document)).find(pin => placeOf(document, pin) && !placeOf(found, pin));
+  return lost ? {problem: `${lost} would have no place: the lengths by which it is given would not meet`} : withLengths(found, document, name);
+}
+
+/** How far the line on which a slide holds a pin is from a place: `offset` (m) along its `normal`, and `size`, the distance of the pin. */
+export function offsetOf(document, pin, origin) {
+  const rail = railOf(document, pin), at = placeOf(document, pin);
+  if (!rail || !at) return null;
+  return {name: rail.name, normal: [-rail.axis[1], rail.axis[0]], offset: cross(rail.axis, minus(at, origin)), size: Math.hypot(...minus(at, origin))};
+}
+
+/** The drawing in which the line of a pin's slide is at another offset; bars at the pin keep their lengths. */
+export function withLine(document, pin, origin, offset) {
+  const found = offsetOf(document, pin, origin), at = placeOf(document, pin), move = offset - found.offset;
+  const moved = movePin(document, pin, [at[0] + move * found.normal[0], at[1] + move * found.normal[1]]);
+  return withLengths(moved, document, null);
 }
 
 const wayOf = (document, {pins: [a, b]}) => { const [x, y] = minus(placeOf(document, b), placeOf(document, a)); return Math.atan2(y, x); };

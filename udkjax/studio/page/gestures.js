@@ -79,6 +79,11 @@ export class Gestures {
       if (this.now.kind === "pull") studio.motion.pause();
       return;
     }
+    const mark = item?.kind === "pin" ? null : studio.dimensions.at(pixel);
+    if (mark) {
+      this.now = {kind: "pan", mark};
+      return;
+    }
     if (!item) {
       this.now = event.shiftKey ? {kind: "area"} : {kind: "pan", clears: true};
       return;
@@ -94,6 +99,7 @@ export class Gestures {
 
   move(event) {
     const {studio} = this, pixel = this.pixel(event);
+    this.element.classList.toggle("on-text", studio.tool === "select" && Boolean(studio.dimensions.at(pixel)));
     if (!this.pointers.has(event.pointerId)) return studio.hover(itemAt(studio.canvas.outlines, studio.canvas.places, pixel), this.start || this.corners.length ? this.follow(event) : null);
     const before = [...this.pointers.values()];
     this.pointers.set(event.pointerId, pixel);
@@ -152,7 +158,8 @@ export class Gestures {
     if (!now || this.pointers.size) return;
     this.now = null;
     studio.preview = null;
-    if (now.kind === "pan" && !this.moved && now.clears) studio.select([]);
+    if (now.kind === "pan" && !this.moved && now.mark) studio.dimensions.open(now.mark);
+    else if (now.kind === "pan" && !this.moved && now.clears) studio.select([]);
     else if (now.kind === "area" && this.moved) studio.select(itemsWithin(studio.document, studio.canvas.places, this.from, this.pixel(event)));
     else if (now.kind === "pull") this.letGo(now);
     else if (now.kind === "drag" && this.moved) this.drop(now);

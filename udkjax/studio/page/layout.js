@@ -37,7 +37,7 @@ export function buildPage(studio, root) {
   });
   parts.canvas = make("canvas", {tabindex: 0, role: "application", "aria-label": "drawing"});
   parts.status = make("p", {class: "status", role: "status"});
-  const toggles = [["grid", "grid"], ["snap", "snap points to the grid (hold Alt to place them freely)"], ["names", "names"], ["paths", "paths of pins"], ...Object.entries(VECTORS)].map(([name, title]) => {
+  const toggles = [["grid", "grid"], ["snap", "snap points to the grid (hold Alt to place them freely)"], ["names", "names"], ["paths", "paths of pins"], ["dimensions", "dimensions of the drawing: click one to change it"], ...Object.entries(VECTORS)].map(([name, title]) => {
     const found = button(name, title, () => {
       studio.show[name] = !studio.show[name];
       found.setAttribute("aria-pressed", studio.show[name]);
@@ -48,6 +48,7 @@ export function buildPage(studio, root) {
   });
   parts.picture = make("div", {class: "group"});
   parts.entry = make("div", {class: "entry"});
+  parts.dimension = make("div", {class: "dimension"});
   parts.wanted = make("div", {class: "wanted", role: "group", "aria-label": "wanted path"});
   const load = button("path", "read a wanted path from a table (CSV) of x and y", () => studio.wanted.input.click());
   const options = make("details", {class: "toggles"}, make("summary", {}, "view"), make("div", {class: "group"}, ...toggles, load, parts.picture));
@@ -62,7 +63,7 @@ export function buildPage(studio, root) {
     })), make("p", {}, "or start from an example"),
     make("div", {class: "group"}, ...FIRST.map(([name, words]) => button(words, `start from this example: ${words}`, () => studio.files.openTemplate(name))),
       button("More …", "open a file or a template (Ctrl+O)", () => studio.files.showOpen())));
-  const stage = make("main", {}, parts.canvas, parts.welcome, options, parts.status, parts.entry, parts.wanted);
+  const stage = make("main", {}, parts.canvas, parts.welcome, options, parts.status, parts.entry, parts.wanted, parts.dimension);
   parts.play = button(icon("play"), "play (space)", () => studio.motion.toggle(), "icon primary");
   parts.home = button(svgIcon(ICONS.home), "back to the drawn position (Home)", () => studio.rewind(), "icon");
   parts.scrub = make("input", {type: "range", min: 0, max: 10000, step: 1, "aria-label": "time", oninput: () => {

@@ -2,6 +2,7 @@
 
 import {angle, angleWritten, length, point, usesNumbers, written} from "./units.js";
 
+const ROUNDING = 1e-9;  // relative to the lengths of a form: an offset below it is none
 const places = new WeakMap();  // of the pins of each document
 const isTable = value => typeof value === "object" && value !== null && !Array.isArray(value);
 const minus = (a, b) => [a[0] - b[0], a[1] - b[1]], plus = (a, b, s = 1) => [a[0] + s * b[0], a[1] + s * b[1]];
@@ -40,7 +41,7 @@ function computed(document) {
 }
 
 /** The direction from which the angle of a form is counted: that of its line, or the x axis. */
-function axisOf({line, along}, at) {
+export function axisOf({line, along}, at) {
   if (Array.isArray(along)) return unit(along);
   return line?.length === 2 ? unit(minus(at[line[1]], at[line[0]])) : [1, 0];
 }
@@ -127,7 +128,25 @@ export function formsOf(document, name, near) {
   const pairs = free.flatMap((a, k) => free.slice(k + 1).map(b => [a, b]));
   return [["coordinates", as(["", ""])],
     ...free.map(from => [`length and angle from ${from}`, as({from, length: 0, angle: 0})]),
-    ...pairs.map(from => [`lengths from ${from.join(" and ")}`, as({from, length: [0, 0], side: "left"})])];
+    ...pairs.map(from => [`lengths from ${from.join(" and ")}`, as({from, length: [0, 0], side: "left"})]),
+    ...pairs.filter(([a, b]) => distanceOf(document, a, b) > 0).map(([from, to]) => [`along the line of ${from}-${to}`, onLine(as({from, to, length: 0, off: 0}), document)])];
+}
+
+const distanceOf = (document, a, b) => Math.hypot(...minus(placesOf(document)[a], placesOf(document)[b]));
+
+/** A form on a line without the offset from it, if that is only rounding. */
+function onLine({off, ...form}, document) {
+  const [a, b] = [length(off, document), length(form.length, document)];
+  return Math.abs(a) <= ROUNDING * Math.max(Math.abs(b), distanceOf(document, form.from, form.to)) ? form : {...form, off};
+}
+
+/** The words of the form in which a pin is given. */
+export function formWords(value) {
+  if (!isTable(value)) return "coordinates";
+  if (value.stacked !== undefined) return `the place of ${value.stacked}`;
+  if (Array.isArray(value.from)) return `lengths from ${value.from.join(" and ")}`;
+  if (value.to !== undefined) return `along the line of ${value.from}-${value.to}`;
+  return value.on === undefined ? `length and angle from ${value.from}` : `length from ${value.from}, on a line through ${value.on}`;
 }
 
 /** The pins in an order in which each one stands behind those that it refers to. */

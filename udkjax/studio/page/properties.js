@@ -5,13 +5,13 @@ import {readValue, valueText} from "./values.js";
 import {shapeProblem} from "./checks.js";
 import {copy} from "./clipboard.js";
 import {remove} from "./keys.js";
-import {lengthOf, withBar, withLengthText} from "./dimensions.js";
+import {lengthOf, withTypedBar} from "./dimensions.js";
 import {numberFields} from "./number_fields.js";
 import {swapPair} from "./actions.js";
 import {camFields} from "./cam_fields.js";
 import {carry} from "./motions.js";
-import {formsOf} from "./pin_forms.js";
-import {angle, angleUnit, angleWritten, direction, expressed, isMeasure, length, lengthName, lengthUnit, placeFrom, shown, tidy, usesNumbers} from "./units.js";
+import {formWords, formsOf} from "./pin_forms.js";
+import {angle, angleUnit, angleWritten, direction, expressed, length, lengthName, lengthUnit, placeFrom, readMeasure, shown, tidy, usesNumbers} from "./units.js";
 import {make} from "./player/elements.js";
 
 // The editable keys of each kind of element, and the kind of quantity of each.
@@ -30,7 +30,6 @@ const KEYS = {
 const USUAL = {link: ["pins"], slide: ["link"], slot: ["pin"], gear: ["links"], cam: ["pins"], motor: [], spring: ["stiffness", "length"], damper: ["damping"], load: []};
 const EXAMPLES = {density: "7850", mass: "0.2 kg", inertia: "1e-4 kg m2", speed: "60 rpm", torque: "1 N m", stiffness: "1 N/mm", damping: "10 N s/m",
   force: "[0 N, -10 N]", angle: "30 deg", direction: "30 deg"};
-const NUMBERS = ["density", "length", "mass", "inertia", "angle", "count", "stiffness", "damping", "speed", "torque"];  // that expressions may give
 const SI = {density: "kg/m³", mass: "kg", inertia: "kg m²", speed: "rad/s", torque: "N m", stiffness: "N/m", damping: "N s/m", force: "N", angle: "rad", direction: "rad", length: "m"};
 
 /** The unit of numbers of a quantity that are written without a unit. */
@@ -85,6 +84,13 @@ export class PropertiesPanel {
     this.studio.say("");
     if (!this.studio.commit(document, select)) this.again();
     return undefined;
+  }
+
+  /** Show the drawing with a number that was typed, and what gave way; or say why it is not possible. */
+  take({document, note, problem}) {
+    if (problem) return this.refuse(problem);
+    this.set(document);
+    return note && this.studio.say(note);
   }
 
   /** Restore the fields, and say why nothing changed. */
@@ -151,8 +157,8 @@ export class PropertiesPanel {
   /** A choice of the form of a pin; choosing one keeps its place. */
   form(name) {
     const {document} = this.studio, links = list(document, "link").filter(link => link.pins?.includes(name));
-    const forms = formsOf(document, name, links.flatMap(link => link.pins).filter(other => other !== name));
-    return this.choice("form", "given by …", forms.map(([words], k) => [words, `${k}`]), k => this.set({...document, pins: {...pinsOf(document), [name]: forms[+k][1]}}), "given by");
+    const now = formWords(pinsOf(document)[name]), others = formsOf(document, name, links.flatMap(link => link.pins).filter(other => other !== name)).filter(([words]) => words !== now);
+    return this.choice("given by", now, others.map(([words], k) => [words, `${k}`]), k => this.set({...document, pins: {...pinsOf(document), [name]: others[+k][1]}}));
   }
 
   /** A list [words, value] of which one is chosen. */
@@ -162,13 +168,7 @@ export class PropertiesPanel {
     return make("label", {class: "field"}, make("span", {}, label), select, make("span", {class: "unit"}));
   }
 
-  /** The value of a text: a number of an expression, where numbers are wanted. */
-  read(text, quantity) {
-    const value = readValue(text, ["name", "names"].includes(quantity));
-    if (usesNumbers(value, this.studio.document)) return value;
-    const number = typeof value === "string" && NUMBERS.concat("direction", "").includes(quantity) && !isMeasure(value) ? expressed(value, quantity === "direction" ? "angle" : quantity, this.studio.document) : undefined;
-    return number ?? value;
-  }
+  read(text, quantity) { return readMeasure(text, quantity, this.studio.document); }
 
   /** The value of an expression of named numbers, with its unit. */
   valueWords(text, quantity) { return `= ${tidy(+expressed(text, quantity, this.studio.document)?.toPrecision(6))} ${unitOf(this.studio.document, quantity)}`; }
@@ -181,20 +181,9 @@ export class PropertiesPanel {
     if (link.pins?.length !== 2 || !a || !b) return [make("p", {}, lengthsText(document, link)), ...facts];
     const size = Math.hypot(b[0] - a[0], b[1] - a[1]), turn = Math.atan2(b[1] - a[1], b[0] - a[0]);
     const own = lengthOf(document, link)?.value, isNamed = usesNumbers(own, document);
-    const put = (long, way, text) => {
-      if (long === size && way === turn && !text && !(isNamed && way === turn)) return this.again();
-      const {document: found, note, problem} = withBar(document, link, long, way);
-      if (problem) return this.refuse(problem);
-      this.set(text && lengthOf(found, link) ? withLengthText(found, link, text) : found);
-      return note && studio.say(note);
-    };
-    const field = (label, quantity, value, unit, take) => this.field(label, value, unit, text => {
-      const read = this.read(text, quantity), next = {length, angle}[quantity](read, document);
-      return Number.isFinite(next) && (quantity !== "length" || next > 0) ? take(next, usesNumbers(read, document) ? read : "") : this.refuse(`"${text}" is not ${quantity === "length" ? "a length" : "an angle"}`);
-    });
+    const field = (quantity, value, unit) => this.field(quantity, value, unit, text => this.take(withTypedBar(document, link, text, quantity)));
     const shownSize = isNamed ? own : tidy(+(size / lengthUnit(document)).toPrecision(9)), sizeUnit = isNamed ? this.valueWords(own, "length") : lengthName(document);
-    return [field("length", "length", shownSize, sizeUnit, (next, text) => put(next, turn, text)),
-      field("angle", "angle", tidy(+(turn / angleUnit(document)).toPrecision(9)), unitOf(document, "angle"), next => put(size, next)), ...facts];
+    return [field("length", shownSize, sizeUnit), field("angle", tidy(+(turn / angleUnit(document)).toPrecision(9)), unitOf(document, "angle")), ...facts];
   }
 
   /** Say where a selected pin is while the mechanism is away from its drawn position. */

@@ -3,6 +3,7 @@
 import {askedFile} from "./api.js";
 import {DrawingCanvas} from "./canvas.js";
 import {CurvesPanel} from "./curves.js";
+import {DimensionMarks} from "./dimension_marks.js";
 import {EMPTY, list, members, nameOf, pinsOf} from "./document.js";
 import {PlaceEntry} from "./entry.js";
 import {FileActions} from "./files.js";
@@ -38,7 +39,7 @@ class Studio {
   constructor(root) {
     this.history = new History({document: EMPTY, text: ""});
     Object.assign(this, {selection: [], hovered: null, tool: "select", preview: null, hand: null, marked: new Map(), paths: [], picture: null});
-    this.show = {grid: true, names: true, paths: true, snap: true};
+    this.show = {grid: true, names: true, paths: true, dimensions: true, snap: true};
     this.view = fit([], 800, 600, NEW_SIZE);
     this.proposed = null;
     this.media = matchMedia("(prefers-color-scheme: dark)");
@@ -56,6 +57,7 @@ class Studio {
     this.wanted = new WantedPath(this, this.parts.wanted);
     this.entry = new PlaceEntry(this, this.parts.entry);
     this.vectors = new Vectors(this);
+    this.dimensions = new DimensionMarks(this, this.parts.dimension);
     this.sync = new Sync(this);
     this.gestures = new Gestures(this, this.parts.canvas);
     followKeys(this);

@@ -2,6 +2,7 @@
 
 import {evaluate, namesIn} from "./expressions.js";
 import {ANGLES, LENGTHS} from "./unit_sizes.js";
+import {readValue} from "./values.js";
 
 const TEXT = /^\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(\S.*?)?\s*$/;
 const DIGITS = 12;  // significant digits of a written number; further ones are rounding
@@ -10,6 +11,7 @@ const DIGITS = 12;  // significant digits of a written number; further ones are 
 export const lengthUnit = document => LENGTHS[document?.units?.length ?? "m"] ?? 1;
 export const angleUnit = document => ANGLES[document?.units?.angle ?? "rad"] ?? 1;
 export const lengthName = document => document.units?.length ?? "m";
+export const angleName = document => ({deg: "°"}[document.units?.angle] ?? ` ${document.units?.angle ?? "rad"}`);
 
 function read(value, plain, units, document) {
   if (typeof value === "number") return value * plain;
@@ -54,6 +56,16 @@ export function expressed(text, quantity, document) {
   const [unit, units] = {length: [lengthUnit(document), LENGTHS], angle: [angleUnit(document), ANGLES]}[quantity] ?? [1, {}];
   const value = evaluate(text, {unit, units, angleUnit: angleUnit(document), numbers: numbersOf(document)});
   return Number.isFinite(value) ? tidy(value) : undefined;
+}
+
+const NUMBERS = ["density", "length", "mass", "inertia", "angle", "count", "stiffness", "damping", "speed", "torque", "direction", ""];  // that expressions may give
+
+/** The value of a typed text: a number of an expression, where numbers are wanted; expressions of named numbers stay texts. */
+export function readMeasure(text, quantity, document) {
+  const value = readValue(text, ["name", "names"].includes(quantity));
+  if (usesNumbers(value, document)) return value;
+  const number = typeof value === "string" && NUMBERS.includes(quantity) && !isMeasure(value) ? expressed(value, quantity === "direction" ? "angle" : quantity, document) : undefined;
+  return number ?? value;
 }
 
 /** The place (m) that a text names: "x, y", or "length @ angle" from a place; null if it is neither. */
