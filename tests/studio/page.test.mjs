@@ -9,6 +9,7 @@ const {valueText, readValue} = await page("values"), view = await page("view"), 
 const clipboard = await page("clipboard"), forms = await page("pin_forms"), joining = await page("joining"), {evaluate} = await page("expressions");
 const {withBar} = await page("dimensions"), {marksOf} = await page("dimension_marks"), {shapeProblem} = await page("checks"), cams = await page("cam_fields");
 const {symbolsOf} = await page("drawn_symbols"), {motionsOf, carry} = await page("motions"), {stateAt} = await page("player/motion"), {TOOLS} = await page("tools");
+const chart = await page("chart"), {alongOf} = await page("along");
 
 const context = {size: 0.01, scale: 1000};
 const at = (x, y, pin = null, link = null) => ({place: [x, y], pin, link, pixel: [1000 * x, -1000 * y]});
@@ -344,6 +345,27 @@ test("an expression of named numbers that is typed as a dimension stays", () => 
   assert.equal(mark("support D 0").take("3*r").document.pins.D[0], "3*r");
   assert.equal(mark("angle B").take("2*r").document.pins.B.angle, "2*r");
   assert.equal(mark("support D 1").take("-12").document.pins.D[1], -12);
+});
+
+test("angles have ticks at parts of a turn, and the extremes of a curve are found", () => {
+  assert.deepEqual(chart.ticks([0, 360], 7, true), [0, 90, 180, 270, 360]);
+  assert.deepEqual(chart.ticks([60, 420], 7, true), [90, 180, 270, 360]);
+  assert.deepEqual(chart.ticks([0, 3600], 7, true), [0, 720, 1440, 2160, 2880, 3600]);
+  assert.deepEqual(chart.extremesOf([3, NaN, 1, 5, 9], 4), [2, 3]);
+  assert.deepEqual(chart.extremesOf([2, 2 + 1e-12, 2], 3), []);
+});
+
+test("one turn of a motor is the first one of the run", () => {
+  for (const sign of [1, -1]) {  // a body that turns by 0.1 rad an instant, twice around
+    const q = Float64Array.from({length: 3 * 126}, (_, k) => (k % 3 === 2 ? sign * 0.1 * Math.floor(k / 3) : 0)), run = {q, ts: Float64Array.from({length: 126}, (_, k) => k), count: 126};
+    const scene = {bodies: ["crank"], drivers: [{name: "motor", pair: [-1, 0], offset: Math.PI / 3}]};
+    const whole = alongOf(run, scene, "motor"), turn = alongOf(run, scene, "motor", true);
+    near(turn.range, [60, 60 + sign * 360].sort((a, b) => a - b));
+    assert.equal(turn.count, 64);  // 0.1 * 63 is the first angle beyond a turn
+    assert.equal(whole.count, 126);
+    near([turn.at(70)], [60 + sign * (7 * 180 / Math.PI - 360)]);
+    near([turn.timeOf(60 + sign * 180)], [10 * Math.PI]);
+  }
 });
 
 test("undo and redo restore the very states, and an equal state adds no step", () => {

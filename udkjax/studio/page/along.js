@@ -13,14 +13,17 @@ function anglesOf({q, count}, {pair, offset}, size) {
   return Float64Array.from({length: count}, (_, i) => (angle(i, pair[1]) - angle(i, pair[0]) + offset) / DEGREE);
 }
 
-/** The axis of a run: its `values` at the instants, their `range` and `unit`, the value `at` a time, that `between` other values, and the time `timeOf` a value. */
-export function alongOf(run, scene, motor = "") {
+/** The axis of a run: its `values` at the instants, of which the first `count` are shown, their `range` and `unit`, the value `at` a
+ *  time, that `between` other values, and the time `timeOf` a value. One turn of a motor ends where its first one does. */
+export function alongOf(run, scene, motor = "", isTurn = false) {
   const driver = turningMotors(scene).find(({name}) => name === motor), size = 3 * scene.bodies.length;
-  const values = driver ? anglesOf(run, driver, size) : Float64Array.from(run.ts).slice(0, run.count);
+  const values = driver ? anglesOf(run, driver, size) : Float64Array.from(run.ts).slice(0, run.count), [first] = values;
   const between = (x, t) => { const [i, j, , s] = interval(run.ts, t, run.count); return x[i] + s * (x[j] - x[i]); };
-  const at = t => between(values, t);
+  const end = driver && isTurn ? values.findIndex(x => Math.abs(x - first) > TURN) : -1, count = end < 0 ? values.length : end + 1;
+  const sign = values[count - 1] < first ? -1 : 1, shown = values.slice(0, count), range = end < 0 ? [Math.min(...shown), Math.max(...shown)] : [first, first + sign * TURN].sort((a, b) => a - b);
+  const wrapped = x => (end < 0 ? x : first + sign * ((sign * (x - first)) % TURN));
   const timeOf = value => firstTime(run, values, value, 0) ?? run.ts[nearest(values, value)];
-  return {values, unit: driver ? "°" : "s", range: [Math.min(...values), Math.max(...values)], at, between, timeOf};
+  return {values, count, unit: driver ? "°" : "s", range, at: t => wrapped(between(values, t)), between, timeOf};
 }
 
 const nearest = (values, value) => values.reduce((best, x, k) => (Math.abs(x - value) < Math.abs(values[best] - value) ? k : best), 0);

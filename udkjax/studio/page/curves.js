@@ -14,6 +14,8 @@ import {Painter, THEMES, contextOf} from "./player/painter.js";
 const ROUNDING = 1e-10;  // relative to the scale of a quantity: values that vary less are constant
 const FIRST_CURVES = 4;  // among which one that is not constant is looked for: those of a pin
 const VIOLATION = "constraint violation";
+const ONE_TURN = ", one turn";
+const TOGETHER = [["x", "speed", "acceleration"], ["angle", "angular velocity", "angular acceleration"]];  // of a pin, and of a link
 
 // The requests that each panel offers: subject, label of the button, tooltip.
 const PANELS = {
@@ -34,11 +36,12 @@ export class CurvesPanel {
     this.over = make("select", {"aria-label": "over", title: "the horizontal axis", onchange: () => studio.redraw()});
     this.more = button("+", "keep this curve, and choose another one as well", () => this.keep());
     this.less = button("−", "show one curve alone", () => { this.keptNames[this.panel] = []; studio.redraw(); });
+    this.all = button("x, v, a", "show position, speed and acceleration together", () => this.together());
     this.keptNames = {};
     this.canvas = make("canvas", {"aria-hidden": "true"});
     this.fact = make("span", {class: "fact", role: "status"});
     element.append(make("div", {class: "strip-bar"}, make("div", {class: "tabs", role: "tablist", "aria-label": "curves of"}, ...this.tabs.map(([, tab]) => tab)),
-      this.select, this.more, this.less, this.over, ...this.actions.map(one => one.button), this.fact), this.canvas);
+      this.select, this.more, this.all, this.less, this.over, ...this.actions.map(one => one.button), this.fact), this.canvas);
     this.canvas.addEventListener("pointerdown", event => { this.canvas.setPointerCapture(event.pointerId); this.seek(event); });
     this.canvas.addEventListener("pointermove", event => { if (event.buttons) this.seek(event); });
     this.open(this.panel);
@@ -61,13 +64,29 @@ export class CurvesPanel {
     this.studio.redraw();
   }
 
+  /** The position, speed and acceleration of the pin or link whose curve is chosen. */
+  three() {
+    const at = this.name.lastIndexOf(": "), names = this.names(), quantity = this.name.slice(at + 2);
+    const found = TOGETHER.map(three => three.map(one => `${this.name.slice(0, at)}: ${one}`)).filter(three => at > 0 && three.every(one => names.includes(one)));
+    return found.find((_, k) => found.length === 1 || TOGETHER[k].includes(quantity)) ?? [];
+  }
+
+  together() {
+    const found = this.three();
+    if (!found.length) return;
+    this.keptNames[this.panel] = found.slice(0, -1);
+    this.chosen[this.panel] = this.select.value = found.at(-1);
+    this.isKept = true;
+    this.studio.redraw();
+  }
+
   get name() { return this.chosen[this.panel] ?? ""; }
 
   seek(event) {
     const box = this.canvas.getBoundingClientRect(), {motion} = this.studio;
     motion.pause();
     if (!motion.end || !this.along) return;
-    motion.seek(this.along.timeOf(valueAt(event.clientX - box.left, box.width, this.along.range)));
+    motion.seek(this.along.timeOf(valueAt(event.clientX - box.left, box.width, this.along.range, this.cache.curves)));
   }
 
   /** The names of the curves of the panel that is open. */
@@ -129,8 +148,9 @@ export class CurvesPanel {
     this.select.replaceChildren(...names.map(name => make("option", {value: name}, name)));
     this.select.value = this.name;
     const motors = this.studio.motion.pageEngine && names.length ? turningMotors(this.studio.motion.pageEngine.scene).map(({name}) => name) : [], {value} = this.over;
-    this.over.replaceChildren(make("option", {value: ""}, "time"), ...motors.map(name => make("option", {value: name}, name)));
-    this.over.value = motors.includes(value) ? value : "";
+    const axes = motors.flatMap(name => [[name, name], [`${name}${ONE_TURN}`, `${name}${ONE_TURN}`]]);
+    this.over.replaceChildren(...[["", "time"], ...axes].map(([axis, words]) => make("option", {value: axis}, words)));
+    this.over.value = axes.some(([axis]) => axis === value) ? value : "";
     this.over.hidden = !motors.length;
     this.select.hidden = this.more.hidden = !names.length;
     this.listed = names.join();
@@ -233,6 +253,7 @@ export class CurvesPanel {
       button.disabled = Boolean(this.busy);
     }
     this.less.hidden = !this.kept().length;
+    this.all.hidden = !this.three().length;
     const said = fact?.document === studio.document ? fact : null;
     const words = this.busy ? "computing …" : said?.words ?? (this.panel === "kinematics" && moves ? studio.findings.travelWords() : "");
     if (this.fact.textContent !== words) this.fact.textContent = this.fact.title = words;
@@ -248,7 +269,8 @@ export class CurvesPanel {
     if (!this.name || !motion.run || motion.run.count < 2) return this.drawNothing(context, theme, width, height);
     const names = [...new Set([...this.kept().filter(name => this.names().includes(name)), this.name])], key = [names.join("\n"), this.panel, motion.run, this.served[this.panel], this.over.value];
     if (!this.cache || key.some((x, k) => x !== this.cache.key[k])) {
-      this.along = alongOf(motion.run, motion.pageEngine.scene, this.over.value);
+      const {value} = this.over, isTurn = value.endsWith(ONE_TURN);
+      this.along = alongOf(motion.run, motion.pageEngine.scene, isTurn ? value.slice(0, -ONE_TURN.length) : value, isTurn);
       this.cache = {key, curves: names.map(name => ({name, ...this.values(name)}))};
     }
     const {along} = this, {curves} = this.cache, now = values => along.between(values, motion.t);
