@@ -17,8 +17,8 @@ direction, such as those of slides, are exact once their signs are.
 
 One round leaves an error of s^8: it suffices if the coefficients are below about a thirtieth of those that jam the mechanism, as
 in most machines. Programs that a run evaluates often take one round, and report loads that have not settled; machine code then
-takes as many further rounds as are needed (`further`). A round begins where the step of the last one ended if the correction was
-not small. Where rounds go back and forth between two sets of signs of the loads, machine code follows the solution from that
+takes as many further rounds as are needed (`further`). A round begins where the step of the last one ended if the correction did
+not bring the loads much closer to a solution. Where rounds go back and forth between two sets of signs of the loads, machine code follows the solution from that
 without friction on, with a growing `friction_share` of G. Programs that are differentiated begin with the loads that settled in
 this way. Other programs take `ROUNDS`. If the loads do not settle, friction admits no motion (the mechanism jams), and the
 accelerations are NaN.
@@ -56,8 +56,9 @@ CORRECTION = SOLVES  # the number of the system of corrections
 # Relative change of the loads of friction by another correction. The accelerations have this error times the share of friction,
 # which is below the smallest tolerance of runs; one more round would end at rounding errors.
 SETTLED = 1e-10
-# Relative change of the loads of friction beyond which a correction, which has the factors of the loads before, is not one: where
-# the direction of a load turns within a step, it undoes what the step has gained. It decides only the number of rounds.
+# Share of what a step has left of the loads of friction. A correction, which has the factors of the loads before, must not change it
+# by more: where the direction of a load turns within a step, it undoes what the step has gained, for ever where the load is nearly
+# zero and its sign another one.
 LARGE_CORRECTION = 1 / 8
 
 
@@ -67,7 +68,7 @@ class FrictionElimination:
     def __init__(self, terms: SceneTerms, symmetric: BlockElimination):
         self.terms, self._symmetric, self._skew = terms, symmetric, SkewElimination(terms, symmetric)
         self.sharing, layout = LoadSharing(terms, symmetric, self._skew), terms.layout
-        layout.sizes |= {"misfit": 1, "rubbing": 1, "drag": layout.coordinate_count, "new_drag": layout.coordinate_count}
+        layout.sizes |= {"misfit": 1, "rubbing": 1, "left": 1, "drag": layout.coordinate_count, "new_drag": layout.coordinate_count}
         layout.add_solve(CORRECTION)
         layout.sizes["settled"] = layout.sizes[f"x{CORRECTION}"]
         layout.sizes["friction_share"] = 1
@@ -132,14 +133,14 @@ class FrictionElimination:
         yield from self._jt(solve, checked=True)
 
     def _copy_solution(self, source: str, to: str, if_small: bool = False) -> ProgramParts:
-        """Copy the x of all rows; with `if_small` only if the last correction was small."""
+        """Copy the x of all rows; with `if_small` only if the last correction left little of what the step before it had left."""
         for group in self.terms.layout.eliminated:
 
             def write(w: KernelWriter, group: ConstraintGroup = group):
                 for i in range(len(group.rows)):
                     new = w.read("from", RIGHT, i)
                     if if_small:
-                        is_large = greater(w.read("misfit", None), w.read("rubbing", None) * LARGE_CORRECTION**2)
+                        is_large = greater(w.read("misfit", None), w.read("left", None) * LARGE_CORRECTION**2)
                         new = where(is_large, w.read("to", RIGHT, i), new)
                     w.write(new, "to", RIGHT, i)
 
@@ -209,8 +210,11 @@ class FrictionElimination:
             yield self.terms.over_rubbing(("slopes", in_part), group, write, x=self.terms.loads_of(solve), v=v)
 
     def _measure(self, solve: int, v: str, in_part: bool) -> ProgramParts:
-        """Compute `misfit` and `rubbing`, squares of the change of G(x) by another correction and of G(x), in the metric of C."""
+        """Compute squares in the metric of C: `misfit` of the change of G(x) by another correction, `left` of that by the last one, and
+        `rubbing` of G(x).
+        """
         yield Reset("misfit", 0, 1)
+        yield Reset("left", 0, 1)
         yield Reset("rubbing", 0, 1)
         yield from self._drag(solve, v, "new_drag", in_part=in_part)
         for group in self.terms.layout.rubbing:
@@ -224,9 +228,11 @@ class FrictionElimination:
             yield self.terms.over_rubbing("size", group, measure_size, x=self.terms.loads_of(solve), v=v)
 
         def measure_change(w: KernelWriter):
-            changes = [w.read("new_drag", BODY_COORDINATES, k) - w.read("drag", BODY_COORDINATES, k) for k in range(3)]
-            squares = [compliance(w, k) * (change * change) for k, change in enumerate(changes)]
-            w.write(sum(squares, w.graph.constant(0.0)), "misfit", None, 0, ADD)
+            drags = [w.read("drag", BODY_COORDINATES, k) for k in range(3)]
+            changes = [w.read("new_drag", BODY_COORDINATES, k) - drag for k, drag in enumerate(drags)]
+            for name, loads in (("misfit", changes), ("left", drags)):
+                squares = [compliance(w, k) * (load * load) for k, load in enumerate(loads)]
+                w.write(sum(squares, w.graph.constant(0.0)), name, None, 0, ADD)
 
         yield self.terms.over_bodies("misfit", measure_change)
 

@@ -14,7 +14,7 @@ from udkjax.expressions.loops.loop_program import ADD, KernelLoop, KernelWriter,
 
 # Arrays that are held fixed in derivatives. Kernels that read sines and cosines differentiate them as functions of q.
 NOT_DIFFERENTIATED = ("t", "sines", "sines1", "psi_q", "gram", "factors", "nearness", "trusted", "y0", "x0")
-NOT_DIFFERENTIATED += ("slopes", "base", "skew", "skew_factors", "misfit", "rubbing", "drag", "new_drag")  # of friction
+NOT_DIFFERENTIATED += ("slopes", "base", "skew", "skew_factors", "misfit", "left", "rubbing", "drag", "new_drag")  # of friction
 NOT_DIFFERENTIATED += LoadSharing.FIXED
 
 # The outputs that are x + z or x - z with z = C J^T y, J C J^T y = right: the right-hand side, x, and the sign.
