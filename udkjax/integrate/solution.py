@@ -253,7 +253,7 @@ class Solution(PrintsTable):
         if mechanism is not None:
             data.attrs["parameters"] = json.dumps({k: np.asarray(v).tolist() for k, v in mechanism.parameters().items()})
             data.attrs["scene"] = scene_text(mechanism)
-            if dataset := efforts(mechanism, self):
+            if not mechanism.massless and (dataset := efforts(mechanism, self)):
                 data = data.assign_coords(driver=list(dataset))
                 data["effort"] = ("time", "driver"), np.stack([np.asarray(x) for x in dataset.values()], 1)
                 units = sorted({mechanism.drivers[name].effort_unit for name in dataset}, reverse=True)

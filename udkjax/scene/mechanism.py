@@ -153,6 +153,12 @@ class Mechanism(PrintsTable, Model, ConvertsItself):
         return self._source.drawing if isinstance(self._source, Drawn) else None
 
     @property
+    def massless(self) -> tuple[str, ...]:
+        """The links of a drawing for which no mass is given."""
+        names = () if self.drawing is None else self.drawing.massless
+        return tuple(name for name in names if f"body.{name}.mass" not in self.direct)
+
+    @property
     def direct(self) -> Mapping[str, Any]:
         """The numbers of a drawn mechanism that were given directly and no longer follow from its drawing, by name."""
         direct = self._source.direct if isinstance(self._source, Drawn) else None

@@ -61,7 +61,10 @@ def trajectory(mech: Mechanism, sol: Solution, ghosts: int = 5) -> Figure:
     draw_motion(panels["scene"], mech, alive, ghosts)
     draw_angles(panels["angles"], mech, ts, q)
     draw_violation(panels["constraints"], ts, violation(mech, sol))
-    draw_energy(panels["energy"], ts, energy(mech, sol))
+    if mech.massless:
+        panels["energy"].text(0.5, 0.5, "no energies without masses", ha="center", transform=panels["energy"].transAxes)
+    else:
+        draw_energy(panels["energy"], ts, energy(mech, sol))
     for name in ("angles", "constraints", "energy"):
         panels[name].set_xlim(ts[0], ts[-1])
         panels[name].tick_params(labelbottom=name in lowest)

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import ArrayLike
+from jaxtyping import Array, ArrayLike
 
 from udkjax.equations.states.quantities import efforts
 from udkjax.integrate import Solution
@@ -38,11 +38,16 @@ def run_summary(
         **numbered("assembly", [text.removeprefix("assembly ") for text in moved]),
         "work": format_work(sol.stats),
         **trust(accuracy),
-        **{name: format_peak(sol.ts, x, mech.drivers[name].effort_unit) for name, x in efforts(mech, sol).items()},
+        **{name: format_peak(sol.ts, x, mech.drivers[name].effort_unit) for name, x in known_efforts(mech, sol).items()},
         "time": f"{seconds:.2f} s, including {compiling:.2f} s to compile",
     }
     span = f"{float(sol.ts[0]):g} to {float(sol.ts[-1]):g} s"
     return table(f"{mech.name or 'mechanism'}, {span}, {len(sol.ts)} output times", lines)
+
+
+def known_efforts(mech: Mechanism, sol: Solution) -> dict[str, Array]:
+    """Return the efforts of the drivers; none where a link has no mass."""
+    return {} if mech.massless else efforts(mech, sol)
 
 
 def trust(accuracy: Accuracy) -> dict[str, str]:
@@ -55,7 +60,7 @@ def trust(accuracy: Accuracy) -> dict[str, str]:
         changed = f"drivers, dampers and loads do {accuracy.work:.6g} J of work"
     lines = {
         "constraint violation": f"at most {format_error(accuracy.violation, accuracy.length)} m or rad",
-        "energy": f"{changed}; {kinetic}",
+        **({} if np.isnan(accuracy.kinetic_energy) else {"energy": f"{changed}; {kinetic}"}),
     }
     if accuracy.error is not None:
         lines["exact solution"] = f"error of at most {format_error(accuracy.error, accuracy.length)} m or rad"

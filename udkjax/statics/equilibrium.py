@@ -24,6 +24,7 @@ from udkjax.programs.undefined import whole
 from udkjax.requirements import concrete_only
 from udkjax.scene.arguments import checked
 from udkjax.scene.elements.friction import Friction
+from udkjax.scene.masses import require_weights
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.numbers.description import format_pose, size_of
 from udkjax.scene.tables.checks import SceneError
@@ -151,6 +152,7 @@ def equilibrium(
     Raises:
         ValueError: all numbers are traced, so that the number of degrees of freedom is unknown.
     """
+    require_weights(mechanism, "equilibria")
     refuse_rolling(mechanism, REST)
     analysis = analyse(mechanism) if analysis is None else analysis
     free = degrees_of_freedom(analysis)
@@ -184,6 +186,7 @@ def equilibria(
     Returns:
         A list of `Equilibrium`, the most stable first: by their lowest omega^2, descending.
     """
+    require_weights(mechanism, "equilibria")
     refuse_rolling(mechanism, REST)
     analysis = analyse(mechanism)
     guesses = random_positions(mechanism, starts, seed, state)

@@ -7,10 +7,11 @@ from typing import Any
 import numpy as np
 
 from udkjax.annotations import JsonObject
-from udkjax.equations.rows.analysis import analyse
+from udkjax.equations.rows.analysis import analyse, require_masses_of_free_motion
 from udkjax.integrate.portable import portable_engine
 from udkjax.native.language.program import UnsupportedError
 from udkjax.positions.answers.counting import Count
+from udkjax.requirements import ArgumentError
 from udkjax.scene import library
 from udkjax.scene.drawing import Drawing
 from udkjax.scene.files import loads
@@ -104,8 +105,10 @@ def compile_drawing(text: str = "", document: Mapping[str, Any] | None = None, e
                 )
         if not isinstance(mechanism.drawing, Drawing):
             raise SceneError(["format: the studio draws files of format 2"])
-    except SceneError as error:
-        return {"text": text, "document": _read(text), "problems": list(error.problems), "scene": None}
+        require_masses_of_free_motion(mechanism, "free motions")
+    except (SceneError, ArgumentError) as error:
+        problems = list(error.problems) if isinstance(error, SceneError) else [str(error)]
+        return {"text": text, "document": _read(text), "problems": problems, "scene": None}
     engine_data = engine_of(mechanism, tables) if engine == "wasm" else {}
     if engine == "recorded":
         engine_data = {"motion": recorded_motion(mechanism)}
@@ -156,6 +159,7 @@ def scene_of(mechanism: Mechanism) -> JsonObject:
         "bodies": list(mechanism.bodies),
         "frames": [[*np.asarray(body.position).tolist(), float(body.angle)] for body in bodies],
         "masses": [float(body.mass) for body in bodies],
+        "massless": list(mechanism.massless),
         "inertias": [float(body.inertia) for body in bodies],
         "gravity": np.asarray(mechanism.gravity).tolist(),
         "length": float(analysis.length),
@@ -189,6 +193,8 @@ def diagnose_drawing(text: str, about: str = "structure", end: JsonObject | None
         return examine(loads(text), text, about, end)
     except SceneError as error:
         return {"problems": list(error.problems)}
+    except ArgumentError as error:  # such as links without mass
+        return {"problems": [str(error)]}
 
 
 def export(text: str, suffix: str) -> JsonObject:

@@ -22,8 +22,8 @@ class Accuracy(NamedTuple):
     """Errors of a run: maxima over the output times that it reached."""
 
     violation: float  # largest violation of a constraint (m or rad)
-    energy_change: float  # largest change of the total energy since the start (J)
-    kinetic_energy: float  # J
+    energy_change: float  # largest change of the total energy since the start (J); NaN if a link has no mass
+    kinetic_energy: float  # J; NaN if a link has no mass
     error: float | None  # largest difference of a coordinate from the exact solution (m or rad); None if none is known
     work: float | None  # work of drivers, dampers, loads and impacts up to the end (J); None if energy is conserved
     length: float  # characteristic length, m
@@ -39,20 +39,27 @@ def accuracy(mechanism: Mechanism, solution: Solution) -> Accuracy:
     Returns:
         An `Accuracy`: the largest violation, energies and error.
     """
+    exact = exact_coordinates(mechanism, solution.ts, solution.q[0], solution.v[0])
+    error = None if exact is None else float(np.nanmax(np.abs(np.asarray(solution.q) - exact)))
+    change, kinetic, work = (np.nan, np.nan, None) if mechanism.massless else _energies(mechanism, solution)
+    return Accuracy(
+        violation=float(np.nanmax(largest_violation(violation(mechanism, solution)))),
+        energy_change=change,
+        kinetic_energy=kinetic,
+        error=error,
+        work=work,
+        length=float(analyse(mechanism).length),
+    )
+
+
+def _energies(mechanism: Mechanism, solution: Solution) -> tuple[float, float, float | None]:
+    """Return the largest change of the total energy, the largest kinetic energy, and the work (J), or None without any."""
     parts = energy(mechanism, solution)
     total = np.asarray(parts.total)
     good = total[np.isfinite(total)]
-    exact = exact_coordinates(mechanism, solution.ts, solution.q[0], solution.v[0])
-    error = None if exact is None else float(np.nanmax(np.abs(np.asarray(solution.q) - exact)))
     works = solution.events is not None or not conserves_energy(mechanism, np.asarray(solution.ts))
-    return Accuracy(
-        violation=float(np.nanmax(largest_violation(violation(mechanism, solution)))),
-        energy_change=float(np.nanmax(np.abs(total - total[0]))),
-        kinetic_energy=float(np.nanmax(np.asarray(parts.kinetic))),
-        error=error,
-        work=float(good[-1] - good[0]) if works else None,
-        length=float(analyse(mechanism).length),
-    )
+    work = float(good[-1] - good[0]) if works else None
+    return float(np.nanmax(np.abs(total - total[0]))), float(np.nanmax(np.asarray(parts.kinetic))), work
 
 
 def conserves_energy(mechanism: Mechanism, ts: Float[ArrayLike, "T"]) -> bool:

@@ -15,13 +15,13 @@ relative to friction that is a share s of them, becomes s e^2 by a step and s^2 
 is of third order. The first slopes are those at x after a correction without slopes, where e is s^2. Loads with a fixed
 direction, such as those of slides, are exact once their signs are.
 
-One round leaves an error of s^8: it suffices if the coefficients are below about a thirtieth of those that jam the mechanism, as
-in most machines. Programs that a run evaluates often take one round, and report loads that have not settled; machine code then
-takes as many further rounds as are needed (`further`). A round begins where the step of the last one ended if the correction did
-not bring the loads much closer to a solution. Where rounds go back and forth between two sets of signs of the loads, machine code follows the solution from that
-without friction on, with a growing `friction_share` of G. Programs that are differentiated begin with the loads that settled in
-this way. Other programs take `ROUNDS`. If the loads do not settle, friction admits no motion (the mechanism jams), and the
-accelerations are NaN.
+One round leaves an error of s^8: it suffices if the coefficients are below about a thirtieth of those that jam the mechanism,
+as in most machines. Programs that a run evaluates often take one round, and report loads that have not settled; machine code
+then takes as many further rounds as are needed (`further`). A round begins where the step of the last one ended if the
+correction did not bring the loads much closer to a solution. Where rounds go back and forth between two sets of signs of the
+loads, machine code follows the solution from that without friction on, with a growing `friction_share` of G. Programs that are
+differentiated begin with the loads that settled in this way. Other programs take `ROUNDS`. If the loads do not settle,
+friction admits no motion (the mechanism jams), and the accelerations are NaN.
 
 A load may obey the equations twice: once as it grows out of the motion without friction, and once with another sign, against
 which friction drives it further. If joints yield ever so little, the second one runs away, so that it is no motion. There the
@@ -56,9 +56,9 @@ CORRECTION = SOLVES  # the number of the system of corrections
 # Relative change of the loads of friction by another correction. The accelerations have this error times the share of friction,
 # which is below the smallest tolerance of runs; one more round would end at rounding errors.
 SETTLED = 1e-10
-# Share of what a step has left of the loads of friction. A correction, which has the factors of the loads before, must not change it
-# by more: where the direction of a load turns within a step, it undoes what the step has gained, for ever where the load is nearly
-# zero and its sign another one.
+# Share of what a step has left of the loads of friction. A correction, which has the factors of the loads before, must not change
+# it by more: where the direction of a load turns within a step, it undoes what the step has gained, for ever where the load is
+# nearly zero and has another sign.
 LARGE_CORRECTION = 1 / 8
 
 
@@ -68,7 +68,13 @@ class FrictionElimination:
     def __init__(self, terms: SceneTerms, symmetric: BlockElimination):
         self.terms, self._symmetric, self._skew = terms, symmetric, SkewElimination(terms, symmetric)
         self.sharing, layout = LoadSharing(terms, symmetric, self._skew), terms.layout
-        layout.sizes |= {"misfit": 1, "rubbing": 1, "left": 1, "drag": layout.coordinate_count, "new_drag": layout.coordinate_count}
+        layout.sizes |= {
+            "misfit": 1,
+            "rubbing": 1,
+            "left": 1,
+            "drag": layout.coordinate_count,
+            "new_drag": layout.coordinate_count,
+        }
         layout.add_solve(CORRECTION)
         layout.sizes["settled"] = layout.sizes[f"x{CORRECTION}"]
         layout.sizes["friction_share"] = 1
@@ -210,9 +216,7 @@ class FrictionElimination:
             yield self.terms.over_rubbing(("slopes", in_part), group, write, x=self.terms.loads_of(solve), v=v)
 
     def _measure(self, solve: int, v: str, in_part: bool) -> ProgramParts:
-        """Compute squares in the metric of C: `misfit` of the change of G(x) by another correction, `left` of that by the last one, and
-        `rubbing` of G(x).
-        """
+        """Compute squares in the metric of C: `rubbing` of G(x), `left` of what the last correction changed, `misfit` of the next."""
         yield Reset("misfit", 0, 1)
         yield Reset("left", 0, 1)
         yield Reset("rubbing", 0, 1)

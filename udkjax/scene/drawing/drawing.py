@@ -186,6 +186,11 @@ class Drawing(AbstractDrawing):
         """The links by name."""
         return self.groups["link"]
 
+    @property
+    def massless(self) -> tuple[str, ...]:
+        """The links for which no mass is given."""
+        return tuple(name for name, link in self.links.items() if not link.has_mass)
+
     def lengths(self) -> dict[str, dict[tuple[str, str], Float[Array, ""]]]:
         """Return the lengths (m) of each link and of the ground, by name and by the two pins between which they are measured."""
         places = places_of(self.groups["pin"])

@@ -17,6 +17,8 @@ from udkjax.scene.drawing.pin_forms import Places, PointArray
 from udkjax.scene.elements.bodies import Body, Frame
 from udkjax.scene.elements.fields import NOT_NEGATIVE, OUTLINE, PIN, POSITIVE, given_names, given_or_none
 
+NOMINAL_MASS = 1.0  # kg, of a link without mass; no result depends on it
+
 
 class Shape(NamedTuple):
     """A plane figure of uniform thickness.
@@ -92,7 +94,8 @@ class Link(PrintsLine):
     A bar goes from the first pin to the last, with half-round ends of diameter `width` about them; more pins may lie on it.
     Without a width a link of three or more pins is a plate, the polygon of its pins in order. A link of one pin is a disc of
     diameter `width` about it. Mass, centre and inertia follow from the shape with `density` and `thickness`, or with `mass`; a
-    bar of given mass without a width is a thin rod. `centre` and `inertia` may be given in addition.
+    bar of given mass without a width is a thin rod. `centre` and `inertia` may be given in addition. Positions, velocities, and
+    a motion that motors determine need no mass: without one, whatever depends on it is refused.
 
     Args:
         pins: the names of its pins, in order.
@@ -126,6 +129,11 @@ class Link(PrintsLine):
         return "bar" if len(self.pins) == 2 or self.width is not None else "plate"
 
     @property
+    def has_mass(self) -> bool:
+        """Whether a mass is given, or follows from a density."""
+        return self.mass is not None or self.density is not None
+
+    @property
     def sides(self) -> list[tuple[str, str]]:
         """The pairs of pins whose distances are the link's lengths: the ends of a bar, and pins that follow each other."""
         ends = [(self.pins[0], self.pins[-1])] if self.kind == "bar" else []
@@ -143,13 +151,22 @@ class Link(PrintsLine):
         points = [places[name] for name in self.pins]
         return polygon(array_namespace(*points).stack(points))
 
+    def _nominal_shape(self, places: Places) -> Shape:
+        """Return a shape for a link without mass, as large as the whole drawing: it only weighs corrections of positions."""
+        xp = array_namespace(*places.values())
+        size = xp.max(xp.ptp(xp.stack([*places.values()]), axis=0))
+        centre = xp.mean(xp.stack([places[name] for name in self.pins]), axis=0)
+        return Shape(0.0, centre, xp.where(size > 0.0, size, 1.0) ** 2 / 12)
+
     def body(self, places: Places, velocities: Places) -> "DrawnBody":
         """Return the link's mass properties, position and velocity, given the positions (m) and velocities (m/s) of the pins."""
         if self.inertia is not None and self.centre is not None and self.mass is not None:
             shape = Shape(0.0, by_numpy(self.centre), 0.0)  # area and radius are not used
+        elif not self.has_mass:
+            shape = self._nominal_shape(places)
         else:
             shape = self.shape(places)
-        mass = self.mass  # a number that the link gives is the same object in the body: one leaf
+        mass = self.mass if self.has_mass else NOMINAL_MASS  # a number of the link is the same object in the body: one leaf
         if mass is None:
             assert self.density is not None and self.thickness is not None
             mass = by_numpy(self.density) * by_numpy(self.thickness) * shape.area

@@ -121,8 +121,12 @@ def _link_mistakes(link: Link) -> Iterator[str]:
         return
     if len(set(link.pins)) < len(link.pins):
         yield ".pins: names a pin twice"
-    if (link.density is None) == (link.mass is None):
-        yield ": give a density, with a thickness, or a mass" + (", not both" if link.mass is not None else "")
+    if link.density is not None and link.mass is not None:
+        yield ": give a density, with a thickness, or a mass, not both"
+    elif not link.has_mass and link.thickness is not None:
+        yield ": give a density, with a thickness, or a mass"
+    elif not link.has_mass and link.inertia is not None:
+        yield ".inertia: needs a mass: give one, or a density, with a thickness"
     elif link.density is not None and link.thickness is None:
         yield ".thickness: missing; a mass by density needs it"
     elif link.kind == "disc" and link.width is None and (link.density is not None or link.inertia is None):

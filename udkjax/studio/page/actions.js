@@ -8,6 +8,8 @@ import {centrePin, corners} from "./shapes.js";
 import {angleUnit, lengthUnit, niceBelow, tidy, written} from "./units.js";
 
 const STEEL = {density: 7850};  // kg/m^3
+const BAR = {width: 0.01, thickness: 0.002};  // m: of a new link, whatever the zoom, so that its mass depends on its length alone
+const OTHER_SCALE = 10;  // ratio of the size that suits the view to the usual one, from which on new links have another size
 const PIXELS_PER_NEWTON = 5;
 const TEETH = 20;
 const LIFT = 0.4, CAM_POINTS = 12;  // lift of a new cam as a fraction of the radius at its follower, and knots of its profile
@@ -21,11 +23,12 @@ function pinFor(document, {pin, link, place}) {
   return addPin(document, place);
 }
 
-/** Width and thickness of a new link: those of the last one, or sizes that suit the view. */
+/** Width and thickness of a new link: those of the last one, or of the usual bar, or sizes that suit a view of much larger or smaller links. */
 function section(document, size) {
   const old = list(document, "link").filter(link => link.density !== undefined && link.thickness !== undefined && link.pins.length > 1).at(-1);
-  const unit = lengthUnit(document), width = old?.width ?? tidy(niceBelow(size) / unit);
-  return {density: old?.density ?? STEEL.density, width, thickness: old?.thickness ?? tidy(niceBelow(size / 3) / unit)};
+  const isUsual = size < OTHER_SCALE * BAR.width && BAR.width < OTHER_SCALE * size, unit = lengthUnit(document);
+  const [width, thickness] = isUsual ? [BAR.width, BAR.thickness].map(x => tidy(x / unit)) : [size, size / 5].map(x => tidy(niceBelow(x) / unit));
+  return {density: old?.density ?? STEEL.density, width: old?.width ?? width, thickness: old?.thickness ?? thickness};
 }
 
 const isApart = (document, a, b) => { const [p, q] = [a, b].map(pin => placeOf(document, pin)); return p[0] !== q[0] || p[1] !== q[1]; };

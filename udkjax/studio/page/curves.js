@@ -110,10 +110,13 @@ export class CurvesPanel {
 
   dynamic() {
     const {energies, pageEngine} = this.studio.motion;
-    if (!energies) return [];
+    if (!energies || pageEngine.scene.massless.length) return [];
     const known = pageEngine.scene.drivers.filter(({name}) => energies.efforts[name]?.some(Number.isFinite));
     return [...known.map(({effort}) => effort), "kinetic energy", "potential energy", "energy"];
   }
+
+  /** The links whose masses forces and energies would need. */
+  lacking() { return (this.studio.motion.pageEngine?.scene.massless ?? []).join(", "); }
 
   /** The server's answer for the open panel, if it is about this drawing. */
   servedFor() {
@@ -249,7 +252,7 @@ export class CurvesPanel {
   showBar() {
     const {studio} = this, {motion} = studio, moves = motion.run?.count > 1, fact = this.facts[this.panel];
     for (const {panel, name, button} of this.actions) {
-      button.hidden = panel !== this.panel || !motion.run || (!moves && name !== "rest");
+      button.hidden = panel !== this.panel || !motion.run || (!moves && name !== "rest") || Boolean(this.lacking());
       button.disabled = Boolean(this.busy);
     }
     this.less.hidden = !this.kept().length;
@@ -279,7 +282,8 @@ export class CurvesPanel {
 
   drawNothing(context, theme, width, height) {
     const moves = this.studio.motion.run?.count > 1;
-    const words = moves ? "Press a button above to compute curves." : "Curves appear here once the mechanism moves.";
+    const lacking = this.panel !== "kinematics" && this.lacking();
+    const words = lacking ? `No mass of ${lacking}: give each a mass, or a density with a thickness.` : moves ? "Press a button above to compute curves." : "Curves appear here once the mechanism moves.";
     new Painter(context, {x: 0, y: 0, scale: 1}, theme, 1, null).text(words, [width / 2, height / 2], theme.soft, {align: "center", halo: false});
   }
 }

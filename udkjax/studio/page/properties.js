@@ -175,7 +175,7 @@ export class PropertiesPanel {
 
   /** Length and angle of a bar of two pins as fields, or the lengths of another link; and its mass. */
   shape(link) {
-    const {studio, studio: {document}} = this, masses = studio.motion.pageEngine?.masses(), mass = masses?.get(link.name);
+    const {studio, studio: {document}} = this, {pageEngine} = studio.motion, isKnown = pageEngine && !pageEngine.scene.massless.includes(link.name), mass = isKnown ? pageEngine.masses().get(link.name) : undefined;
     const facts = [mass === undefined || link.mass !== undefined ? "" : `mass ${shown(mass, "kg")}`].filter(Boolean).map(words => make("p", {}, words));
     const [a, b] = (link.pins ?? []).map(pin => placeOf(document, pin));
     if (link.pins?.length !== 2 || !a || !b) return [make("p", {}, lengthsText(document, link)), ...facts];

@@ -89,6 +89,8 @@ def _violation(mechanism: Mechanism, solution: ShownMotion) -> list[MeasureCurve
 
 
 def _energy(mechanism: Mechanism, solution: ShownMotion) -> list[MeasureCurve]:
+    if mechanism.massless:
+        return []
     parts = energy(mechanism, solution)
     total = np.asarray(parts.total)
     changed_by = "energy change" if conserves_energy(mechanism, solution.ts) else "work of drivers and loads"
@@ -119,7 +121,7 @@ def _rank(mechanism: Mechanism, solution: ShownMotion) -> list[MeasureCurve]:
 
 def _effort(mechanism: Mechanism, solution: ShownMotion) -> list[MeasureCurve]:
     units = {name: ("torque", "N m") if d.coordinate == "angle" else ("force", "N") for name, d in mechanism.drivers.items()}
-    by_driver = efforts(mechanism, solution).items()
+    by_driver = [] if mechanism.massless else efforts(mechanism, solution).items()
     return [MeasureCurve(f"{units[name][0]} of {name}", units[name][1], np.asarray(values)) for name, values in by_driver]
 
 
