@@ -216,7 +216,7 @@ class FrictionElimination:
             yield self.terms.over_rubbing(("slopes", in_part), group, write, x=self.terms.loads_of(solve), v=v)
 
     def _measure(self, solve: int, v: str, in_part: bool) -> ProgramParts:
-        """Compute squares in the metric of C: `rubbing` of G(x), `left` and `misfit` of its change by a correction and the next."""
+        """Compute squares in the metric of C: `rubbing` of G(x), `left` and `misfit` of its change by two corrections."""
         yield Reset("misfit", 0, 1)
         yield Reset("left", 0, 1)
         yield Reset("rubbing", 0, 1)
