@@ -89,7 +89,7 @@ def test_what_needs_no_mass_is_as_with_masses():
 
 
 def needing(light, free):
-    """Calls that depend on masses, by function, with what the message says depends on them."""
+    """Calls that depend on masses, by function."""
     run, (q, v) = udk.simulate(light, TIMES), (light.q0, light.v0)
     record = udk.simulate(with_masses(free), TIMES)
     values = {"pin.A.length": np.array([0.04, 0.041])}

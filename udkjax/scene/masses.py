@@ -1,4 +1,4 @@
-"""Refusals of what depends on masses, in drawings that give none for a link."""
+"""Refusals of results that depend on masses, in drawings that give none for a link."""
 
 from typing import Any
 
@@ -16,8 +16,8 @@ def require_masses(mechanism: Any, asked_by: str, unless: str = "") -> None:
 
     Args:
         mechanism: A mechanism, or a model of another kind, which has masses.
-        asked_by: What depends on masses, in the plural: "reactions".
-        unless: What would make masses unnecessary: "or let motors determine the motion".
+        asked_by: The results that depend on masses, in the plural: "reactions".
+        unless: Another cure: "or let motors determine the motion".
 
     Raises:
         ArgumentError: A link has none.

@@ -56,7 +56,7 @@ CORRECTION = SOLVES  # the number of the system of corrections
 # Relative change of the loads of friction by another correction. The accelerations have this error times the share of friction,
 # which is below the smallest tolerance of runs; one more round would end at rounding errors.
 SETTLED = 1e-10
-# Share of what a step has left of the loads of friction. A correction, which has the factors of the loads before, must not change
+# Share of the rest of the loads of friction after a step. A correction, which has the factors of the loads before, must not change
 # it by more: where the direction of a load turns within a step, it undoes what the step has gained, for ever where the load is
 # nearly zero and has another sign.
 LARGE_CORRECTION = 1 / 8
@@ -139,7 +139,7 @@ class FrictionElimination:
         yield from self._jt(solve, checked=True)
 
     def _copy_solution(self, source: str, to: str, if_small: bool = False) -> ProgramParts:
-        """Copy the x of all rows; with `if_small` only if the last correction left little of what the step before it had left."""
+        """Copy the x of all rows; with `if_small` only if the last correction left little of the rest."""
         for group in self.terms.layout.eliminated:
 
             def write(w: KernelWriter, group: ConstraintGroup = group):

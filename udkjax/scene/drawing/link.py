@@ -130,7 +130,7 @@ class Link(PrintsLine):
 
     @property
     def has_mass(self) -> bool:
-        """Whether a mass is given, or follows from a density."""
+        """True if a mass is given, or follows from a density."""
         return self.mass is not None or self.density is not None
 
     @property

@@ -65,7 +65,7 @@ export function drawDisc(document, from, to, {size}) {
   return {document: made, select: [last(made, "link")]};
 }
 
-/** Fix a pin to the ground, or free it; where there is none, a new one is fixed, on the link that is there. */
+/** Fix a pin to the ground, or free it; elsewhere a new pin is fixed, of the link under it if there is one. */
 export function drawGround(document, target) {
   const [found, name] = pinFor(document, target);
   return {document: toggleGround(found, name), select: [{kind: "pin", name}]};

@@ -39,8 +39,8 @@ export function fragmentOf(document, items) {
 const sameUnits = (a, b) => JSON.stringify(Object.entries(a ?? {}).sort()) === JSON.stringify(Object.entries(b ?? {}).sort());
 
 /**
- * The document with a fragment, (dx, dy) metres away, the items that are new, and `note`, what was left out and why. What the
- * fragment names and does not have, such as the ground's pin of a motor, is that of the drawing. `problem` if it does not fit.
+ * The document with a fragment, (dx, dy) metres away, the items that are new, and a `note` of elements that are left out. Names
+ * of other elements, such as the pin of a motor, are those of the drawing. `problem` if it does not fit.
  */
 export function withFragment(document, fragment, dx, dy) {
   const isBlank = !Object.keys(pinsOf(document)).length;
@@ -77,7 +77,7 @@ export function withFragment(document, fragment, dx, dy) {
   return {document: found, select, note};
 }
 
-/** Copies of what is selected, a little away. */
+/** Add a copy of the selection, a little away. */
 export function copy(studio) {
   if (!studio.selection.length) return studio.say("select something to duplicate it");
   return paste(studio, fragmentOf(studio.document, studio.selection));

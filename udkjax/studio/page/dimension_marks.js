@@ -77,7 +77,7 @@ function* supportMarks(document) {
   }
 }
 
-/** How far the lines of slides are from the first support. */
+/** The distances of the lines of slides from the first support. */
 function* lineMarks(document) {
   const first = groundOf(document).find(name => placeOf(document, name)), origin = first && placeOf(document, first);
   for (const pin of origin ? Object.keys(pinsOf(document)) : []) {

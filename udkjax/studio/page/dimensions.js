@@ -136,7 +136,7 @@ export function withPinNumber(document, name, [key, k], text, quantity) {
   return lost ? {problem: `${lost} would have no place: the lengths by which it is given would not meet`} : withLengths(found, document, name);
 }
 
-/** How far the line on which a slide holds a pin is from a place: `offset` (m) along its `normal`, and `size`, the distance of the pin. */
+/** The distance `offset` (m), along its `normal`, of the line on which a slide holds a pin from a place, and `size`, that of the pin. */
 export function offsetOf(document, pin, origin) {
   const rail = railOf(document, pin), at = placeOf(document, pin);
   if (!rail || !at) return null;
