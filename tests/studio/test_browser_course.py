@@ -168,3 +168,26 @@ def test_motors_move_slides_and_cylinders_by_mouse(studio):
     assert studio.document["motor"] == [{"between": ["C", "B"], "speed": "0.1 m/s"}]
     assert studio.document["ground"] == ["A", "C"]
     assert not studio.problems
+
+
+@pytest.mark.slow
+def test_a_sheet_is_printed_with_drawing_and_answers(studio):
+    (studio.folder / "printed.toml").write_text(FOUR_BAR, encoding="utf-8")
+    studio.js("studio.files.openFile('printed.toml')")
+    studio.settle()
+    studio.page.emulate_media(media="print", color_scheme="dark")
+    studio.js("window.dispatchEvent(new Event('beforeprint'))")
+    sheet = studio.page.locator(".print-sheet")
+    assert "time ratio of rocker" in sheet.inner_text()
+    ratios = studio.js(
+        "Promise.all([...document.querySelectorAll('.print-sheet img')].map(image => image.decode().then(() =>"
+        " [image.naturalWidth / image.naturalHeight, image.clientWidth / image.clientHeight])))"
+    )
+    assert len(ratios) == 2
+    for natural, shown in ratios:  # circles stay circles
+        np.testing.assert_allclose(shown, natural, rtol=0.01)
+    assert not studio.page.locator("header").is_visible()
+    studio.js("window.dispatchEvent(new Event('afterprint'))")
+    assert studio.js("document.querySelectorAll('.print-sheet').length") == 0
+    studio.page.emulate_media(media="screen", color_scheme="light")
+    assert not studio.problems

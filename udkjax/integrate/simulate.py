@@ -20,7 +20,7 @@ from udkjax.arrays import is_traced, is_within_jit, make_module, number, put_arr
 from udkjax.devices import on_host
 from udkjax.equations.laws.formulations import Formulation
 from udkjax.equations.laws.udwadia_kalaba import Baumgarte
-from udkjax.equations.rows.analysis import Analysis, analysis_of, require_masses_of_free_motion
+from udkjax.equations.rows.analysis import Analysis, analysis_of
 from udkjax.equations.systems.general import ConstrainedSystem
 from udkjax.integrate.causes.find import explained
 from udkjax.integrate.compiled_mechanism import compile_concrete, compile_mechanism
@@ -156,7 +156,7 @@ def simulate(
     Source:
         D. de Falco, E. Pennestri, L. Vita, The Udwadia-Kalaba formulation, ECCOMAS Multibody Dynamics 2005.
     """
-    require_masses_of_free_motion(mechanism, "free motions")
+    Analysis.require_masses(mechanism, "free motions")
     ts = jnp.asarray(ts) if is_traced(ts) else ts  # also a list with tracers
     if not isinstance(rtol, Tracer) and not isinstance(atol, Tracer) and np.asarray(rtol) + np.asarray(atol) < LEAST_ATOL:
         raise ArgumentError(

@@ -16,7 +16,7 @@ from udkjax.annotations import NumberLike, Numbers
 from udkjax.argument_types import BY_NAME, COUNT, NOT_NEGATIVE, POSITIVE
 from udkjax.arrays import float_type, is_traced, is_within_jit, make_module, number, stored
 from udkjax.devices import on_host
-from udkjax.equations.rows.analysis import Analysis, analysis_of, require_masses_of_free_motion
+from udkjax.equations.rows.analysis import Analysis, analysis_of
 from udkjax.equations.systems.general import ConstrainedSystem
 from udkjax.integrate.compiled_mechanism import compile_mechanism
 from udkjax.integrate.derivatives import differentiable
@@ -77,7 +77,7 @@ def step(
         ValueError: there are inputs for a `ConstrainedSystem`.
         TypeError: an input is a `Held`.
     """
-    require_masses_of_free_motion(mechanism, "free motions")
+    Analysis.require_masses(mechanism, "free motions")
     moved: Any = mechanism
     if isinstance(mechanism, ConstrainedSystem):
         if inputs:

@@ -15,6 +15,7 @@ from udkjax.arrays import QuickMethods
 from udkjax.requirements import ArgumentError
 from udkjax.scene.numbers.number_fields import NumberField, must_be_positive
 from udkjax.scene.numbers.units import units_of
+from udkjax.wording import join_names, quote
 
 _NONE: Mapping[str, Any] = MappingProxyType({})
 
@@ -65,6 +66,26 @@ class RunModel(QuickMethods):
     def may_have_kinks(self) -> bool:
         """True if jumps or kinks of its loads may be located."""
         return False
+
+    @property
+    def massless(self) -> tuple[str, ...]:
+        """The links of a drawing for which no mass is given; positions, velocities and driven motions need none."""
+        return ()
+
+    def require_masses(self, asked_by: str, cure: str = "") -> None:
+        """Require masses of all links.
+
+        Args:
+            asked_by: The results that depend on masses, in the plural: "reactions".
+            cure: Another cure than a mass: "let motors determine the motion".
+
+        Raises:
+            ArgumentError: A link has none.
+        """
+        if names := self.massless:
+            links, lacks = join_names([quote(name) for name in names]), "has" if len(names) == 1 else "have"
+            cures = "give each a density with a thickness, or a mass" + (f", or {cure}" if cure else "")
+            raise ArgumentError(f"{links} {lacks} no mass, on which {asked_by} depend: {cures}")
 
     @property
     def without_origin(self) -> Self:

@@ -24,7 +24,6 @@ from udkjax.programs.undefined import whole
 from udkjax.requirements import concrete_only
 from udkjax.scene.arguments import checked
 from udkjax.scene.elements.friction import Friction
-from udkjax.scene.masses import require_weights
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.numbers.description import format_pose, size_of
 from udkjax.scene.tables.checks import SceneError
@@ -121,6 +120,11 @@ def _format_rate(omega2: float) -> str:
     return f"{omega:.6g} rad/s ({omega / (2 * math.pi):.6g} Hz)" if omega2 >= 0 else f"exp({omega:.6g} t)"
 
 
+def _require_weights(mechanism: Mechanism) -> None:
+    if mechanism.massless and not (mechanism.is_concrete and np.all(np.asarray(mechanism.gravity) == 0.0)):
+        mechanism.require_masses("equilibria", "give the scene gravity = [0, 0]")
+
+
 @checked
 def equilibrium(
     mechanism: Mechanism,
@@ -152,7 +156,7 @@ def equilibrium(
     Raises:
         ValueError: all numbers are traced, so that the number of degrees of freedom is unknown.
     """
-    require_weights(mechanism, "equilibria")
+    _require_weights(mechanism)
     refuse_rolling(mechanism, REST)
     analysis = analyse(mechanism) if analysis is None else analysis
     free = degrees_of_freedom(analysis)
@@ -186,7 +190,7 @@ def equilibria(
     Returns:
         A list of `Equilibrium`, the most stable first: by their lowest omega^2, descending.
     """
-    require_weights(mechanism, "equilibria")
+    _require_weights(mechanism)
     refuse_rolling(mechanism, REST)
     analysis = analyse(mechanism)
     guesses = random_positions(mechanism, starts, seed, state)

@@ -24,7 +24,6 @@ from udkjax.positions.following.kinematics import kinematics
 from udkjax.printing import PrintedTable, PrintsTable, fields_table, format_numbers, units
 from udkjax.programs.deferred import deferred
 from udkjax.scene.arguments import checked
-from udkjax.scene.masses import require_masses
 from udkjax.scene.mechanism import Mechanism
 from udkjax.statics.admissible_reactions import UNBALANCED, largest_effort, reactions_at
 from udkjax.wording import join_names
@@ -129,7 +128,7 @@ def holding_efforts(
     Raises:
         SceneError: no such driver or coordinate, or positions do not follow from it.
     """
-    require_masses(mechanism, "efforts at rest")
+    mechanism.require_masses("efforts at rest")
     driven = drive(mechanism, driver, 0.0, held)
     q = kinematics(mechanism, driver, values, state, held=held).q
     analysis, positions = driven.analysis, jnp.asarray(q).reshape(len(q), -1)

@@ -16,7 +16,6 @@ from udkjax.printing import PrintedTable, PrintsTable, fields_table, format_numb
 from udkjax.programs.control_flow import ControlFlow, solve
 from udkjax.scene.arguments import checked
 from udkjax.scene.elements.friction import Friction
-from udkjax.scene.masses import require_masses
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.tables.position_only import refuse_rolling
 from udkjax.statics.equilibrium import degrees_of_freedom, equilibrium
@@ -97,7 +96,7 @@ def modes(mechanism: Mechanism, state: State | None = None, t: NumberLike = 0.0,
     Returns:
         The `Modes` of the f degrees of freedom.
     """
-    require_masses(mechanism, "frequencies")
+    mechanism.require_masses("frequencies")
     refuse_rolling(mechanism, "modes need positions that the constraints determine")
     analysis = analyse(mechanism) if analysis is None else analysis
     free = degrees_of_freedom(analysis)

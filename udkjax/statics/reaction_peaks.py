@@ -24,7 +24,6 @@ from udkjax.programs.deferred import deferred
 from udkjax.scene.arguments import checked
 from udkjax.scene.elements.bodies import GROUND
 from udkjax.scene.elements.joints import Cam, Revolute
-from udkjax.scene.masses import require_masses
 from udkjax.scene.mechanism import Mechanism
 
 UNITS = units(force="N", rms_force="N", torque="N m", rms_torque="N m", force_time="s", torque_time="s")
@@ -85,7 +84,7 @@ def reaction_peaks(mechanism: Mechanism, solution: Annotated[StateHistory, HISTO
     Raises:
         ValueError: fewer than three output times.
     """
-    require_masses(mechanism, "reactions")
+    mechanism.require_masses("reactions")
     ts = jnp.asarray(solution.ts)
     if len(ts) < 3:
         raise ValueError(f"a peak needs at least 3 output times, not {len(ts)}")
@@ -110,7 +109,7 @@ def pin_reactions(
     Returns:
         Force x, force y (N), and the torque (N m) about the pin (T, 3), by pin and body. Joints without a point have no pin.
     """
-    require_masses(mechanism, "reactions")
+    mechanism.require_masses("reactions")
     by_pin: dict[str, dict[str, Array]] = {}
     loads = reactions(mechanism, solution, **{"about": "joint", **choices})
     for name, joint in mechanism.joints.items():

@@ -33,7 +33,7 @@ from udkjax.studio.worker import Worker, WorkerPool
 MEDIA_TYPES = {".html": "text/html", ".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
 FOLDERS = {"": ("udkjax.studio", "page"), "player/": ("udkjax.show.player", ".")}  # package and folder of each address prefix
 UNIT_SIZES = "unit_sizes.js"  # a module of the page that is made from the package's table of units
-EXPORTS = (".html", ".svg", ".png", ".gif", ".dxf", ".csv", ".py")
+EXPORTS = (".html", ".svg", ".png", ".gif", ".mp4", ".dxf", ".csv", ".py")
 
 
 class Studio:

@@ -39,7 +39,7 @@ def exported(mechanism: Mechanism, text: str, suffix: str) -> bytes:
     Args:
         mechanism: mechanism of the drawing.
         text: text of its file.
-        suffix: .html (a live page), .svg, .png, .gif or .dxf, as `animate` saves them; .csv (positions over time) or .py (a
+        suffix: .html (a live page), .svg, .png, .gif, .mp4 or .dxf, as `animate` saves them; .csv (positions over time) or .py (a
             script).
     """
     if suffix == ".py":

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from udkjax.annotations import JsonObject
-from udkjax.equations.rows.analysis import analyse, require_masses_of_free_motion
+from udkjax.equations.rows.analysis import Analysis, analyse
 from udkjax.integrate.portable import portable_engine
 from udkjax.native.language.program import UnsupportedError
 from udkjax.positions.answers.counting import Count
@@ -105,7 +105,7 @@ def compile_drawing(text: str = "", document: Mapping[str, Any] | None = None, e
                 )
         if not isinstance(mechanism.drawing, Drawing):
             raise SceneError(["format: the studio draws files of format 2"])
-        require_masses_of_free_motion(mechanism, "free motions")
+        Analysis.require_masses(mechanism, "free motions")
     except (SceneError, ArgumentError) as error:
         problems = list(error.problems) if isinstance(error, SceneError) else [str(error)]
         return {"text": text, "document": _read(text), "problems": problems, "scene": None}

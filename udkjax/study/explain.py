@@ -22,7 +22,6 @@ from udkjax.programs.deferred import deferred
 from udkjax.requirements import concrete_only
 from udkjax.scene.arguments import checked
 from udkjax.scene.elements.friction import Friction
-from udkjax.scene.masses import require_masses
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.diagnosis.joint_friction import joint_friction
 from udkjax.study.explanation import Explanation, Gauss, RubbingTerms
@@ -55,7 +54,7 @@ def explain(
     Source:
         D. de Falco, E. Pennestri, L. Vita, The Udwadia-Kalaba formulation, ECCOMAS Multibody Dynamics 2005, section 3.
     """
-    require_masses(mechanism, "accelerations")
+    mechanism.require_masses("accelerations")
     state = assemble(mechanism, t, state)
     analysis = analyse(mechanism)
     q, v = jnp.ravel(state.q), jnp.ravel(state.v)

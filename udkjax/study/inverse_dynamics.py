@@ -38,7 +38,6 @@ from udkjax.scene.arguments import checked
 from udkjax.scene.elements.drivers import Motion, Spline
 from udkjax.scene.elements.fields import CALLED
 from udkjax.scene.elements.forces import ForceElement
-from udkjax.scene.masses import require_masses
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.tables.checks import SceneError
 from udkjax.study.driver_efforts import driver_efforts, elements_of
@@ -183,7 +182,7 @@ def inverse_dynamics(
         SceneError: there are no drivers, or a name is unknown.
         ValueError: the number of states of `motion` differs from that of `ts`.
     """
-    require_masses(mechanism, "efforts")
+    mechanism.require_masses("efforts")
     times: Any = number(ts) if is_traced(ts) else np.array(ts, float)
     computed = None
     if motion is None and not mechanism.drivers and analyse(mechanism).degrees_of_freedom != 0:
@@ -235,7 +234,7 @@ def feed_forward(mechanism: Mechanism, found: InverseDynamics) -> Mechanism:
     Raises:
         ValueError: an effort is undetermined at some time.
     """
-    require_masses(mechanism, "efforts")
+    mechanism.require_masses("efforts")
     if not isinstance(found.ts, Tracer) and not np.all(found.determined):
         t = float(found.ts[int(np.argmin(found.determined))])
         raise ValueError(

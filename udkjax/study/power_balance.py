@@ -29,7 +29,6 @@ from udkjax.scene.arguments import checked
 from udkjax.scene.elements.bodies import Frame
 from udkjax.scene.elements.forces import ForceElement
 from udkjax.scene.elements.friction import Friction
-from udkjax.scene.masses import require_masses
 from udkjax.scene.mechanism import Mechanism
 
 
@@ -100,7 +99,7 @@ def power_balance(
     Returns:
         The `PowerBalance` (W). Joints that events add, and contacts that may rest, are among its joints.
     """
-    require_masses(mechanism, "powers")
+    mechanism.require_masses("powers")
     ts, flat = jnp.asarray(solution.ts), (len(solution.ts), -1)
     q, v = (jnp.asarray(x).reshape(flat) for x in (solution.q, solution.v))
     scene, method = scene_along(mechanism, solution), SVD() if method is None else method

@@ -56,9 +56,9 @@ CORRECTION = SOLVES  # the number of the system of corrections
 # Relative change of the loads of friction by another correction. The accelerations have this error times the share of friction,
 # which is below the smallest tolerance of runs; one more round would end at rounding errors.
 SETTLED = 1e-10
-# Share of the rest of the loads of friction after a step. A correction, which has the factors of the loads before, must not change
-# it by more: where the direction of a load turns within a step, it undoes what the step has gained, for ever where the load is
-# nearly zero and has another sign.
+# Share of the rest of the loads of friction after a step. A correction, which has the factors of the loads before, must not
+# change it by more: where the direction of a load turns within a step, it undoes what the step has gained, for ever where the
+# load is nearly zero and has another sign.
 LARGE_CORRECTION = 1 / 8
 
 

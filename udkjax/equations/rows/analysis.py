@@ -37,7 +37,6 @@ from udkjax.printing import PrintedTable, PrintsTable, format_numbers, has_numbe
 from udkjax.programs.identity_cache import cached_by_identity
 from udkjax.requirements import ArgumentError, GivenArguments
 from udkjax.scene.arguments import checked
-from udkjax.scene.masses import require_masses
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.model import Model, RunModel
 
@@ -130,6 +129,13 @@ class Analysis(PrintsTable):
         """The characteristic mass (kg), the mass of the heaviest body."""
         return self.scales.mass
 
+    @staticmethod
+    def require_masses(model: RunModel, asked_by: str) -> None:
+        """Require masses of all links of a model, unless drivers determine its motion; as its own `require_masses`."""
+        found = analysis_of(model) if model.massless else None
+        if found is not None and (found.rank is None or found.coordinates > found.rank):
+            model.require_masses(asked_by, "let motors determine the motion")
+
     def with_rows_of(self, mechanism: Mechanism, only_switched: bool = False) -> "Analysis":
         """Return the analysis of the mechanism with more constraints, of which rows are redundant is not known.
 
@@ -185,15 +191,6 @@ def analyse(mechanism: Mechanism) -> Analysis:
 def analysis_of(model: RunModel) -> Analysis | None:
     """Return the analysis of a mechanism; a model without bodies has none: its coordinates and rows are of order one."""
     return analyse(model) if isinstance(model, Mechanism) else None
-
-
-def require_masses_of_free_motion(mechanism: Any, asked_by: str) -> None:
-    """Require masses of all links, unless drivers determine the motion; as `require_masses`."""
-    if not getattr(mechanism, "massless", ()):
-        return
-    found = analyse(mechanism)
-    if found.rank is None or found.coordinates > found.rank:
-        require_masses(mechanism, asked_by, "or let motors determine the motion")
 
 
 @cached_by_identity

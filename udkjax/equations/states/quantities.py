@@ -25,7 +25,6 @@ from udkjax.programs.undefined import at_each, defined
 from udkjax.scene.arguments import checked
 from udkjax.scene.elements.bodies import GROUND
 from udkjax.scene.elements.friction import Friction
-from udkjax.scene.masses import require_masses
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.model import Model, RunModel
 
@@ -145,7 +144,7 @@ def accelerations(
         a (m/s^2, rad/s^2) in the shape of q; with `multipliers` also lambda (m,) in N and N m, in the order of the rows, with
         the sign of M a + Psi_q^T lambda = F, and of minimum norm where constraints are redundant.
     """
-    require_masses(mechanism, "accelerations")
+    mechanism.require_masses("accelerations")
     analysis, model = analysis_of(mechanism) if analysis is None else analysis, mechanism.without_origin
     if analysis is not None and formulation is None and by_numpy(model, (t, q, v, analysis, stabilization), method):
         one_q, one_v = (np.reshape(np.asarray(x, float), (1, -1)) for x in (q, v))
@@ -188,7 +187,7 @@ def energy(mechanism: Mechanism | ConstrainedSystem, solution: Annotated[History
     Returns:
         The `Energy`, kinetic and potential (T,), in J.
     """
-    require_masses(mechanism, "energies")
+    mechanism.require_masses("energies")
     if by_numpy(mechanism, (solution.ts, solution.q, solution.v)):
         return Energy(*jax.device_put([*state_arrays(mechanism.without_origin).energy(*history_of(solution)).T]))
     return _evaluate_along(mechanism, solution, _energy)
@@ -213,7 +212,7 @@ def efforts(
         For each driver its torque (N m) along an angle, or force (N) along a length, (T,); NaN where the states are NaN, and
         zero while an event of a `Solution` has released the driver.
     """
-    require_masses(mechanism, "efforts")
+    mechanism.require_masses("efforts")
     if not mechanism.driver_names:
         return {}
     scene, method = scene_along(mechanism, solution), SVD() if method is None else method
@@ -252,7 +251,7 @@ def friction_loads(
         For each friction and each body of its joint the load (T, 3) about the centre of mass: force x, force y (N) and torque
         (N m). That of a contact with friction "floor" is named "floor.contact friction".
     """
-    require_masses(mechanism, "loads of friction")
+    mechanism.require_masses("loads of friction")
     scene = scene_along(mechanism, solution)
     frictions = {name: force for name, force in scene.mechanism.forces.items() if isinstance(force, Friction)}
     if not frictions:

@@ -34,7 +34,6 @@ from udkjax.scene.elements.bodies import GROUND, GROUND_FRAME, Frame, Point, bet
 from udkjax.scene.elements.drivers import Driver
 from udkjax.scene.elements.joints import Constraint, Distance
 from udkjax.scene.elements.rolling import RollingJoint
-from udkjax.scene.masses import require_masses
 from udkjax.scene.mechanism import Mechanism
 
 Axes = Literal["ground", "body", "joint"]
@@ -78,7 +77,7 @@ def reactions(
     Raises:
         ValueError: a compliance is negative or belongs to an unknown joint, or a joint has the wrong number of compliances.
     """
-    require_masses(mechanism, "reactions")
+    mechanism.require_masses("reactions")
     if isinstance(mechanism, ConstrainedSystem):
         if compliances is not None or (frame, about) != ("ground", "centre"):
             raise ValueError("the coordinates of a ConstrainedSystem have no frame: leave out frame, about and compliances")

@@ -17,7 +17,6 @@ from udkjax.scene.elements.forces import Spring, Torque, TorsionSpring
 from udkjax.scene.elements.friction import Friction
 from udkjax.scene.elements.held import Held
 from udkjax.scene.elements.joints import Angle, Constraint, Distance, Prismatic, Revolute, Slot, Weld
-from udkjax.scene.masses import require_masses
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.mechanism_tables import check_known
 from udkjax.scene.mjcf.body_tree import unique_name
@@ -61,8 +60,8 @@ def mjcf_text(mechanism: Mechanism | Drawing) -> str:
     Raises:
         SceneError: MJCF has no equivalent for an element, or a joint of the tree is open; the error lists all of them.
     """
-    require_masses(mechanism, "motions in MuJoCo")
     mechanism = mechanism.mechanism() if isinstance(mechanism, Drawing) else mechanism
+    mechanism.require_masses("motions in MuJoCo")
     check_known(mechanism, mechanism.name)
     return _Writer(jax.tree.map(np.asarray, mechanism.without_origin)).text()
 

@@ -16,7 +16,6 @@ from udkjax.integrate.events.law.conditions import Gap
 from udkjax.integrate.events.law.event import ExpandsToEvents, expand_events
 from udkjax.integrate.simulate import simulate
 from udkjax.scene.arguments import checked, require_mechanism
-from udkjax.scene.masses import require_masses
 from udkjax.scene.mechanism import Mechanism
 from udkjax.show.player import pictures
 from udkjax.show.player.live import live_data
@@ -282,7 +281,7 @@ def animate_modes(
     Raises:
         ValueError: `shapes` has the wrong shape, or a mode moves nothing.
     """
-    require_masses(mechanism, "modes")
+    mechanism.require_masses("modes")
     shapes = np.asarray(shapes, float)
     if shapes.shape[1:] != (len(mechanism.bodies), 3) or not len(shapes):
         raise ValueError(f"shapes has shape {shapes.shape}, not (modes, {len(mechanism.bodies)}, 3)")

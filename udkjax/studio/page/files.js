@@ -5,7 +5,7 @@ import {shapeProblem} from "./checks.js";
 import {EMPTY} from "./document.js";
 import {make} from "./player/elements.js";
 
-const EXPORTS = {html: "live page, simulates offline", svg: "vector picture", png: "bitmap picture", gif: "animated picture", dxf: "drawing for CAD",
+const EXPORTS = {html: "live page, simulates offline", svg: "vector picture", png: "bitmap picture", gif: "animated picture", mp4: "film", dxf: "drawing for CAD",
   csv: "table of the motion", py: "Python script"};
 
 export class FileActions {

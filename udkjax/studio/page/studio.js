@@ -16,6 +16,7 @@ import {followKeys} from "./keys.js";
 import {buildPage} from "./layout.js";
 import {Motion} from "./motion.js";
 import {Pictures} from "./pictures.js";
+import {followPrinting} from "./print.js";
 import {PropertiesPanel} from "./properties.js";
 import {SourcePanel} from "./source.js";
 import {Sync} from "./sync.js";
@@ -61,6 +62,7 @@ class Studio {
     this.sync = new Sync(this);
     this.gestures = new Gestures(this, this.parts.canvas);
     followKeys(this);
+    followPrinting(this, root);
     this.media.addEventListener("change", () => this.retheme());
     new ResizeObserver(() => (this.isFitted ? this.fit() : this.redraw())).observe(this.parts.canvas);
     this.retheme();

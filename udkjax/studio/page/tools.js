@@ -30,7 +30,7 @@ const SCALE = {name: "scale", title: "Set the scale of the picture: drag between
 export const toolOf = name => (name === "scale" ? SCALE : TOOLS.find(tool => tool.name === name));
 
 export const KEYS = [
-  ["Ctrl Z", "undo"], ["Ctrl Y, Ctrl Shift Z", "redo"], ["Ctrl N or Alt N", "new"], ["Ctrl O, Ctrl S", "open, save"], ["Ctrl A", "select all"], ["Ctrl C, X, V", "copy, cut, paste, also into another drawing"], ["Ctrl D", "duplicate"], ["Delete", "delete"],
+  ["Ctrl Z", "undo"], ["Ctrl Y, Ctrl Shift Z", "redo"], ["Ctrl N or Alt N", "new"], ["Ctrl O, Ctrl S", "open, save"], ["Ctrl A", "select all"], ["Ctrl C, X, V", "copy, cut, paste, also into another drawing"], ["Ctrl D", "duplicate"], ["Delete", "delete"], ["Ctrl P", "print the drawing, its curves and answers"],
   ["Enter, or a digit", "type a place for the tool: A, or 12, 30, or 50 @ 60"], ["F", "fit the view"], ["Esc", "leave the tool"], ["Space", "play, pause"], ["Home", "back to the drawn position"], ["Arrows", "move the selection, or step through time"], ["Wheel", "zoom"],
   ["Drag the background", "pan"], ["Shift drag", "select an area"], ["Alt", "place without snapping"], ["Drop a pin on a pin", "merge them"],
   ...TOOLS.map(tool => [tool.key.toUpperCase(), tool.title]),

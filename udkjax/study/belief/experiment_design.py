@@ -20,7 +20,7 @@ from jaxtyping import Float
 
 from udkjax.annotations import Numbers
 from udkjax.argument_types import NOT_NEGATIVE, TIMES, ArgumentRequirement, of_kind
-from udkjax.equations.rows.analysis import require_masses_of_free_motion
+from udkjax.equations.rows.analysis import Analysis
 from udkjax.positions.assembling.assembly import State
 from udkjax.printing import PrintedTable, prints_table
 from udkjax.requirements import concrete_only
@@ -145,7 +145,7 @@ def design_experiment(
     Raises:
         IdentificationError: lists every mistake.
     """
-    require_masses_of_free_motion(mechanism, "free motions")
+    Analysis.require_masses(mechanism, "free motions")
     experiments = [_candidate(candidate, k) for k, candidate in enumerate(candidates)]
     problems = [] if experiments else ["candidates: the list is empty"]
     ts = np.asarray(ts, float)

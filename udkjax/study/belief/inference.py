@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import Annotated, Any
 
 from udkjax.argument_types import NOT_NEGATIVE, NOT_NEGATIVE_COUNT
-from udkjax.equations.rows.analysis import require_masses_of_free_motion
+from udkjax.equations.rows.analysis import Analysis
 from udkjax.requirements import concrete_only
 from udkjax.scene.arguments import checked
 from udkjax.study.identify.density.log_density import InferenceProblem
@@ -60,7 +60,7 @@ def inference(
     Raises:
         IdentificationError: lists every mistake, such as a start that cannot be simulated or where a prior has no density.
     """
-    require_masses_of_free_motion(mechanism, "free motions")
+    Analysis.require_masses(mechanism, "free motions")
     tol = float(tol)
     problem = build_problem(mechanism, data, parameters, settings, noise, ignore, seed, "auto", initial_state, tol)
     unknowns, functions = with_normal_priors(problem.unknowns, priors or {})

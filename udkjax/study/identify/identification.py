@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from udkjax.annotations import Numbers
 from udkjax.argument_types import FINITE, NOT_NEGATIVE, NOT_NEGATIVE_COUNT
-from udkjax.equations.rows.analysis import require_masses_of_free_motion
+from udkjax.equations.rows.analysis import Analysis
 from udkjax.integrate.solution import CAUSES, Result
 from udkjax.progress import ProgressOption, report_progress
 from udkjax.requirements import concrete_only
@@ -102,7 +102,7 @@ def identify(
     Raises:
         IdentificationError: lists every mistake, including parameters that would open a loop with redundant constraints.
     """
-    require_masses_of_free_motion(mechanism, "free motions")
+    Analysis.require_masses(mechanism, "free motions")
     start, tol = time.perf_counter(), float(tol)
     problem = build_problem(mechanism, data, parameters, settings, noise, ignore, seed, strategy, initial_state, tol)
     first = _first_guesses(problem, n_starts, guesses)

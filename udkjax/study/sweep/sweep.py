@@ -13,7 +13,7 @@ import numpy as np
 
 from udkjax.annotations import Numbers
 from udkjax.argument_types import BY_NAME, COUNT, TIMES, ArgumentRequirement, of_kind
-from udkjax.equations.rows.analysis import require_masses_of_free_motion
+from udkjax.equations.rows.analysis import Analysis
 from udkjax.extras import require
 from udkjax.integrate.solution import Result
 from udkjax.progress import Progress, ProgressOption, report_progress
@@ -115,7 +115,7 @@ def sweep(
         StoreError: `out` cannot be written to, or contains another sweep.
         ClusterError: there is no client, or its workers cannot compute the sweep.
     """
-    require_masses_of_free_motion(mechanism, "free motions")
+    Analysis.require_masses(mechanism, "free motions")
     require("xarray", *(("dask", "distributed") if engine == "dask" else ()))
     studied = {"design": design, "reference": reference, "derivatives": derivatives, "units": units}
     plan = make_plan(mechanism, axes, ts, measure, **studied, **settings)

@@ -16,7 +16,6 @@ from udkjax.native.runs import RunStates
 from udkjax.requirements import ArgumentError
 from udkjax.scene.arguments import checked
 from udkjax.scene.elements.bodies import GROUND
-from udkjax.scene.masses import require_masses
 from udkjax.scene.mechanism import Mechanism
 
 What = Literal[
@@ -128,7 +127,7 @@ def export_c(
             a file of other origin that would be replaced.
         AssemblyError: the initial guess cannot be closed.
     """
-    require_masses(mechanism, "exported accelerations")
+    mechanism.require_masses("exported accelerations")
     times = 0.05 * np.arange(401) if ts is None else np.asarray(ts, float)
     if times.ndim != 1 or len(times) < 2 or not (np.diff(times) > 0).all():
         raise ArgumentError("ts must be at least two increasing times")

@@ -21,7 +21,6 @@ from udkjax.integrate.portable.parameters import guess_of, places_of_numbers
 from udkjax.native.c import c_function
 from udkjax.requirements import ArgumentError
 from udkjax.scene.arguments import checked
-from udkjax.scene.masses import require_masses
 from udkjax.scene.mechanism import Mechanism
 
 Kind = Literal["co-simulation", "model-exchange"]
@@ -106,7 +105,7 @@ def export_fmu(
             impossible; there is no compiler; or the times are wrong.
         AssemblyError: the initial guess cannot be closed.
     """
-    require_masses(mechanism, "exported accelerations")
+    mechanism.require_masses("exported accelerations")
     chosen: list[str] = [kind for kind in KINDS if kind in kinds]
     if not kinds or set(kinds) - set(KINDS):
         raise ArgumentError(f"kinds must be a list of {', '.join(KINDS)}, not {', '.join(map(str, kinds)) or 'empty'}")

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from udkjax.argument_types import NOT_NEGATIVE, NOT_NEGATIVE_COUNT
-from udkjax.equations.rows.analysis import require_masses_of_free_motion
+from udkjax.equations.rows.analysis import Analysis
 from udkjax.integrate.solution import CAUSES, Result
 from udkjax.printing import PrintedTable, html_table, text_table
 from udkjax.requirements import concrete_only
@@ -205,7 +205,7 @@ def check_gradients(
         IdentificationError: as for `identify`, the motion cannot be simulated to its end, or a direction names no unknown, or
             changes none.
     """
-    require_masses_of_free_motion(mechanism, "free motions")
+    Analysis.require_masses(mechanism, "free motions")
     problem, tol = build_problem(mechanism, data, parameters, settings, ignore=ignore, seed=seed), float(tol)
     return compare_gradients(problem, np.zeros(problem.K), (tol, tol), seed, order, directions)
 
