@@ -164,6 +164,7 @@ class Beginning(NamedTuple):
 def begin(mechanism: Any, t: Any, analysis: Analysis | None, state: State | None, closure: Closure | None) -> Beginning:
     """Analyse a model, and assemble its guess at the time t (s), unless these are given."""
     analysis = analysis_of(mechanism) if analysis is None else analysis
+    Analysis.require_masses(mechanism, "free motions")
     moves = ""
     if state is None and closure is None:
         closure = close(mechanism, t, analysis=analysis)

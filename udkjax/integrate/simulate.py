@@ -156,7 +156,6 @@ def simulate(
     Source:
         D. de Falco, E. Pennestri, L. Vita, The Udwadia-Kalaba formulation, ECCOMAS Multibody Dynamics 2005.
     """
-    Analysis.require_masses(mechanism, "free motions")
     ts = jnp.asarray(ts) if is_traced(ts) else ts  # also a list with tracers
     if not isinstance(rtol, Tracer) and not isinstance(atol, Tracer) and np.asarray(rtol) + np.asarray(atol) < LEAST_ATOL:
         raise ArgumentError(

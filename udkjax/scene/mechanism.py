@@ -155,8 +155,10 @@ class Mechanism(PrintsTable, Model, ConvertsItself):
     @property
     def massless(self) -> tuple[str, ...]:
         """The links of a drawing for which no mass is given."""
-        names = () if self.drawing is None else self.drawing.massless
-        return tuple(name for name in names if f"body.{name}.mass" not in self.direct)
+        source = self._source
+        if not isinstance(source, Drawn) or not source.drawing.massless:
+            return ()
+        return tuple(name for name in source.drawing.massless if f"body.{name}.mass" not in self.direct)
 
     @property
     def direct(self) -> Mapping[str, Any]:

@@ -85,6 +85,7 @@ class Drawing(AbstractDrawing):
     ground: tuple[str, ...] = eqx.field(static=True)
     units: tuple[tuple[str, str], ...] = eqx.field(static=True)  # the units in which it was written
     formulas: tuple[Formula, ...] = eqx.field(static=True)  # numbers that expressions give
+    massless: tuple[str, ...] = eqx.field(static=True)  # links for which no mass is given
     _names: tuple[tuple[str, ...], ...] = eqx.field(static=True)  # names of the elements of each section
     _elements: tuple[tuple[Any, ...] | None, ...]
 
@@ -128,7 +129,7 @@ class Drawing(AbstractDrawing):
             raise SceneError([*unknown, *checked.problems], name)
         self.name, self.gravity, self.ground = name, number(checked.gravity), tuple(ground)
         self.units = tuple((units or {}).items())
-        self.formulas = checked.formulas
+        self.formulas, self.massless = checked.formulas, _without_mass(checked.groups)
         self._names, self._elements = _in_order(without_expressions(checked.groups, checked.formulas))
 
     @classmethod
@@ -136,7 +137,7 @@ class Drawing(AbstractDrawing):
         """Return the drawing of elements that were read without mistakes."""
         names, elements = _in_order(without_expressions(checked.groups, checked.formulas))
         head: dict[str, Any] = {"name": name, "gravity": number(checked.gravity), "ground": tuple(ground)}
-        head |= {"units": tuple(units.items()), "formulas": checked.formulas}
+        head |= {"units": tuple(units.items()), "formulas": checked.formulas, "massless": _without_mass(checked.groups)}
         return make_module(cls, **head, _names=names, _elements=elements)
 
     @property
@@ -185,11 +186,6 @@ class Drawing(AbstractDrawing):
     def links(self) -> dict[str, Link]:
         """The links by name."""
         return self.groups["link"]
-
-    @property
-    def massless(self) -> tuple[str, ...]:
-        """The links for which no mass is given."""
-        return tuple(name for name, link in self.links.items() if not link.has_mass)
 
     def lengths(self) -> dict[str, dict[tuple[str, str], Float[Array, ""]]]:
         """Return the lengths (m) of each link and of the ground, by name and by the two pins between which they are measured."""
@@ -299,7 +295,12 @@ class Drawing(AbstractDrawing):
         if checked.problems:
             raise SceneError(checked.problems, self.name)
         own = without_expressions(checked.groups | {"number": plain["number"]}, self.formulas)
-        return make_module(Drawing, **vars(self) | {"gravity": gravity, "_elements": _in_order(own)[1]})
+        changed = {"gravity": gravity, "massless": _without_mass(checked.groups), "_elements": _in_order(own)[1]}
+        return make_module(Drawing, **vars(self) | changed)
+
+
+def _without_mass(groups: Mapping[str, Mapping[str, Any]]) -> tuple[str, ...]:
+    return tuple(name for name, link in groups["link"].items() if link.density is link.mass is None)
 
 
 def _in_order(groups: Mapping[str, Mapping[str, Any]]) -> tuple[tuple[tuple[str, ...], ...], tuple[tuple[Any, ...] | None, ...]]:

@@ -129,11 +129,6 @@ class Link(PrintsLine):
         return "bar" if len(self.pins) == 2 or self.width is not None else "plate"
 
     @property
-    def has_mass(self) -> bool:
-        """True if a mass is given, or follows from a density."""
-        return self.mass is not None or self.density is not None
-
-    @property
     def sides(self) -> list[tuple[str, str]]:
         """The pairs of pins whose distances are the link's lengths: the ends of a bar, and pins that follow each other."""
         ends = [(self.pins[0], self.pins[-1])] if self.kind == "bar" else []
@@ -153,6 +148,7 @@ class Link(PrintsLine):
 
     def _nominal_shape(self, places: Places) -> Shape:
         """Return a shape for a link without mass, as large as the whole drawing: it only weighs corrections of positions."""
+        assert all(np.shape(place) == (2,) for place in places.values())  # else a part of the drawing is missing
         xp = array_namespace(*places.values())
         size = xp.max(xp.ptp(xp.stack([*places.values()]), axis=0))
         centre = xp.mean(xp.stack([places[name] for name in self.pins]), axis=0)
@@ -162,12 +158,14 @@ class Link(PrintsLine):
         """Return the link's mass properties, position and velocity, given the positions (m) and velocities (m/s) of the pins."""
         if self.inertia is not None and self.centre is not None and self.mass is not None:
             shape = Shape(0.0, by_numpy(self.centre), 0.0)  # area and radius are not used
-        elif not self.has_mass:
+        elif self.mass is None and self.density is None:
             shape = self._nominal_shape(places)
         else:
             shape = self.shape(places)
-        mass = self.mass if self.has_mass else NOMINAL_MASS  # a number of the link is the same object in the body: one leaf
-        if mass is None:
+        mass = self.mass  # a number that the link gives is the same object in the body: one leaf
+        if mass is None and self.density is None:
+            mass = NOMINAL_MASS
+        elif mass is None:
             assert self.density is not None and self.thickness is not None
             mass = by_numpy(self.density) * by_numpy(self.thickness) * shape.area
         inertia = by_numpy(mass) * shape.square_radius if self.inertia is None else self.inertia

@@ -123,9 +123,9 @@ def _link_mistakes(link: Link) -> Iterator[str]:
         yield ".pins: names a pin twice"
     if link.density is not None and link.mass is not None:
         yield ": give a density, with a thickness, or a mass, not both"
-    elif not link.has_mass and link.thickness is not None:
+    elif link.density is link.mass is None and link.thickness is not None:
         yield ": give a density, with a thickness, or a mass"
-    elif not link.has_mass and link.inertia is not None:
+    elif link.density is link.mass is None and link.inertia is not None:
         yield ".inertia: needs a mass: give one, or a density, with a thickness"
     elif link.density is not None and link.thickness is None:
         yield ".thickness: missing; a mass by density needs it"

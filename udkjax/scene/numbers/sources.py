@@ -104,15 +104,11 @@ class AbstractDrawing(PrintsTable):
 
     @property
     @abstractmethod
-    def massless(self) -> tuple[str, ...]:
-        """The links for which no mass is given."""
-
-    @property
-    @abstractmethod
     def own_groups(self) -> Mapping[str, Mapping[str, eqx.Module]]:
         """The elements as the leaves of the drawing hold them: without the numbers that expressions give."""
 
     formulas: eqx.AbstractVar[tuple[Formula, ...]]
+    massless: eqx.AbstractVar[tuple[str, ...]]  # the links for which no mass is given
 
     @abstractmethod
     def with_groups(self, groups: Mapping[str, Mapping[str, Any]], gravity: Array) -> "AbstractDrawing":
