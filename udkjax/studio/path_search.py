@@ -62,7 +62,7 @@ def _points(path: object) -> np.ndarray:
 def _drawn(design: CurveDesign, points: np.ndarray) -> JsonObject:
     """Return a design as a drawing, with the largest distance of `points` from its curve."""
     text = merge_document("", _rounded(read_document(dumps(design.mechanism))))
-    off = np.linalg.norm(points[:, None] - design.curve[None], axis=2).min(1)
+    off = _distances(points, design.curve)
     return {
         "document": read_document(text),
         "text": text,
@@ -70,6 +70,15 @@ def _drawn(design: CurveDesign, points: np.ndarray) -> JsonObject:
         "turns": design.turns,
         "transmission": design.transmission,
     }
+
+
+def _distances(points: np.ndarray, curve: np.ndarray) -> np.ndarray:
+    """Return the distance (P,) of each point from the closed polygon of a curve."""
+    along = np.roll(curve, -1, axis=0) - curve
+    arms = points[:, None] - curve
+    square = np.maximum((along**2).sum(1), np.finfo(float).tiny)
+    share = np.clip((arms * along).sum(2) / square, 0.0, 1.0)
+    return np.linalg.norm(arms - share[..., None] * along, axis=2).min(1)
 
 
 def _rounded(value: Any) -> Any:
