@@ -191,6 +191,10 @@ def test_a_long_equation_may_end_its_lines_between_terms():
     short, long = "a = b + c", r"a = (b + c) + \frac{d + e}{f} + " + "g" * 80
     assert mathml.terms(short) == [short]
     assert mathml.terms(long) == ["a = (b + c)", r"+ \frac{d + e}{f}", "+ " + "g" * 80]
+
+
+def test_names_in_equations_have_underscores():
+    pytest.importorskip("latex2mathml", reason="sh install.sh --docs brings latex2mathml")
     assert r"\_" not in mathml.mathml(r"\text{static\_coefficient}")
 
 
