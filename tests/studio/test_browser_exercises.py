@@ -124,7 +124,7 @@ def test_an_offset_slider_crank(studio):
 
 @pytest.mark.slow
 def test_whitworths_quick_return(studio):
-    """The lever turns about a pin beside that of the crank: the pin of the crank runs in its slot."""
+    """The pin of the crank runs in the slot of a lever, which turns about another pin of the ground."""
     hand = Hand(studio)
     hand.tool("g")
     hand.click((0, 0))
