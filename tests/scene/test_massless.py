@@ -158,3 +158,11 @@ def test_masses_of_some_links_are_missing():
     )
     found, heavy = udk.equilibrium(weightless), udk.equilibrium(with_masses(weightless))
     np.testing.assert_allclose(found.q, heavy.q, atol=1e-8)
+
+
+def test_events_that_change_a_motion_need_masses():
+    """A motor that lets go leaves a free motion, although it determined the motion before."""
+    late, light = (lambda t, bodies: t - 0.2), drawn()
+    assert udk.simulate(light, TIMES, events=udk.Event(late, udk.Log())).result == udk.Result.successful
+    with pytest.raises(ValueError, match='"rocker" have no mass, on which motions after events depend: give each a density'):
+        udk.simulate(light, TIMES, events=udk.Event(late, udk.Release("motor1")))

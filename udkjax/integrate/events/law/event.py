@@ -298,6 +298,8 @@ def _check(event: Event, mechanism: Any) -> None:
     if action.needs_joints:
         kind = type(action).__name__
         mechanism.require_bodies(f"{where}: {kind} changes the joints of a mechanism, and this system has none")
+    if action.changes:
+        mechanism.require_masses("motions after events")
     action.check(mechanism, where)
 
 
