@@ -268,6 +268,14 @@ test("a whole drawing is copied with its motor, its forms and its numbers", () =
   }
 });
 
+test("coordinates of a link move with its copy, and a file of an outline stays its file", () => {
+  const square = (x, size) => [[x, 0], [x + size, 0], [x + size, size], [x, size]], own = {outline: square(0, 40), holes: [square(10, 5)], centre: [20, 20]};
+  const given = freeze({...fourBar(), link: fourBar().link.map((link, k) => (k === 0 ? {...link, ...own} : k === 1 ? {...link, outline: {file: "a.dxf"}} : link))});
+  const links = copied(given, [{kind: "link", index: 0}, {kind: "link", index: 1}]).document.link.slice(-2);
+  assert.deepEqual([links[0].outline[0], links[0].holes[0][2], links[0].centre], [[10, -10], [25, -5], [30, 10]]);
+  assert.deepEqual(links[1].outline, {file: "a.dxf"});
+});
+
 test("what a copy names is taken from the drawing, or it is left out and named", () => {
   const before = fourBar(), inches = freeze({...d.EMPTY, units: {length: "in", angle: "deg"}, pins: {X: [0, 0]}});
   const motor = [{kind: "motor", index: 0}];

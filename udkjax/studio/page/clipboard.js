@@ -8,7 +8,7 @@ import {usesNumbers} from "./units.js";
 
 const MARK = "udkjax drawing";  // the key of a fragment in the text of the clipboard
 const COPY_PIXELS = 24;  // between the original and its copy
-const COORDINATE_KEYS = ["centre", "outline"];  // of a link, in the axes of the drawing
+const COORDINATE_KEYS = ["centre", "outline", "holes"];  // of a link, in the axes of the drawing
 
 const textsIn = value => (typeof value === "string" ? [value] : value && typeof value === "object" ? Object.values(value).flatMap(textsIn) : []);
 
@@ -64,7 +64,7 @@ export function withFragment(document, fragment, dx, dy) {
     for (const {name, ...entry} of fragment[section] ?? []) {
       const known = new Set(["ground", ...Object.keys(pinsOf(found)), ...LISTS.flatMap(s => list(found, s).map((_, k) => nameOf(found, s, k)))]);
       const own = {...entry, ...Object.fromEntries(NAME_KEYS.filter(key => key in entry).map(key => [key, again(entry[key])])),
-        ...Object.fromEntries(COORDINATE_KEYS.filter(key => typeof entry[key] === "object").map(key => [key, shiftedPoints(entry[key], found, dx, dy)]))};
+        ...Object.fromEntries(COORDINATE_KEYS.filter(key => Array.isArray(entry[key])).map(key => [key, shiftedPoints(entry[key], found, dx, dy)]))};
       const missing = namesOf(own).find(one => !known.has(one));
       if (missing) { gone.push(`${name} is left out: ${missing} is not in this drawing`); continue; }
       const fresh = freshName(found, name.replace(/\d+$/, ""));
