@@ -13,6 +13,7 @@ from tests.choices import fast
 from udkjax.positions.following.curve import NumpyCurve
 from udkjax.statics import linearization
 from udkjax.statics.linearization import NumpyLinearizer, TracedLinearizer
+from udkjax.statics.resting_forces import forces_table
 
 LENGTHS, GROUND = (1.0, 2.5, 2.0), 2.5
 STIFFNESS, FREE_LENGTH = 60.0, 1.2
@@ -69,6 +70,33 @@ def _without_basis(found):
     N = np.asarray(found.directions)
     matrices = [N @ np.asarray(x) @ N.T for x in (found.mass, found.damping, found.stiffness)]
     return *matrices, N @ np.asarray(found.force), found.loads, found.multipliers
+
+
+JACK = """
+format = 2
+units = {length = "mm", angle = "deg"}
+ground = ["A"]
+gravity = [0, 0]
+pins = {A = [0, 0], B = [80, 60], C = [80, 0], D = [0, 60], E = [120, 60], F = [40, 30], G = [60, 60]}
+link = [
+    {name = "one", pins = ["A", "F", "B"], width = 10}, {name = "other", pins = ["C", "F", "D"], width = 10},
+    {name = "table", pins = ["D", "G", "E"], width = 10}, {name = "foot", pins = ["C"], width = 10},
+]
+slide = [{name = "floor", link = "foot", direction = [1, 0]}]
+slot = [{pin = "B", along = ["D", "E"], on = "table"}]
+motor = [{name = "screw", slide = "floor", speed = "1 mm/s"}]
+load = [{pin = "G", force = ["0 N", "-900 N"]}]
+"""
+
+
+def test_the_table_of_forces_of_a_jack_without_masses():
+    jack = udk.loads(JACK)
+    table = forces_table(jack, udk.assemble(jack).q)
+    forces = {name: cells for name, *cells in table.rows}
+    assert forces["screw holds by"][0] == "-1200 N"  # the load over the slope of the arms
+    assert forces["D on table"] == ["225 N", "0", "225"] and forces["floor on foot"][2] == "675"  # moments about B, and about A
+    assert forces_table(jack.with_parameters({"gravity": [0.0, -9.81]}), jack.q0).title.startswith("forces at rest need weights")
+    assert forces_table(udk.library.parallelogram(), udk.library.parallelogram().q0) is None  # can move
 
 
 def test_rest_of_concrete_numbers_is_found_without_a_trace():

@@ -34,10 +34,10 @@ def kinematics(
 ) -> None:
     """Answer what a course asks of a mechanism: positions, velocities, accelerations, dead points, strokes, type, transmission.
 
-    With --at, tables of all pins and links in one position, with its instant centres; with --count, tables by the driver's value.
-    Values may have units, "60 deg" or "2 turns"; plain numbers are in the unit of the drawing, or in SI units without one. Angles
-    are those of the drawing: the angle of a crank is measured from the x axis to the line from its pin on the ground to its other
-    pin. The exit code is 1 if a value cannot be reached.
+    With --at, tables of all pins and links in one position, with its instant centres, and the forces at rest if a motor holds
+    the mechanism; with --count, tables by the driver's value. Values may have units, "60 deg" or "2 turns"; plain numbers are in
+    the unit of the drawing, or in SI units without one. Angles are those of the drawing: that of a crank is measured from the x
+    axis to the line from its pin on the ground to its other pin. The exit code is 1 if a value cannot be reached.
 
     Args:
         scene: the mechanism.
@@ -68,6 +68,7 @@ def kinematics(
     from udkjax.positions.assembling.coordinates import value_of
     from udkjax.printing import text_table
     from udkjax.show.summary import table
+    from udkjax.statics.resting_forces import forces_table
 
     counted, travel = Count.of(mech, driver), udk.travel(mech, driver)
     speed = usual_rate(mech, driver) if rate is None else counted.read_rate(rate, "--rate")
@@ -107,6 +108,8 @@ def kinematics(
         said = "\n\n".join([said, *(text_table(one, 10**9) for one in tables)])
     if at is not None and reached:
         said += "\n\n" + text_table(centres_table(mech, motion, counted), 10**9)
+        if forces := forces_table(mech, np.asarray(motion.q)[0]):
+            said += "\n\n" + text_table(forces, 10**9)
     columns = measure_channels(mech, motion, measured)
     results: dict[str, object] = {
         "driver": driver,

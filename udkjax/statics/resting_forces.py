@@ -6,11 +6,13 @@ import numpy as np
 from jaxtyping import ArrayLike
 
 from udkjax.annotations import NumberLike
+from udkjax.equations.rows.analysis import analyse
 from udkjax.equations.states.quantities import efforts
 from udkjax.positions.following.drive import with_halted_drivers
-from udkjax.printing import align_columns, format_number
+from udkjax.printing import PrintedTable, align_columns, format_number
 from udkjax.scene.mechanism import Mechanism
 from udkjax.statics.reaction_peaks import RestingPositions, pin_reactions, unique_pin_forces
+from udkjax.wording import join_names
 
 
 class RestingForces(NamedTuple):
@@ -22,13 +24,45 @@ class RestingForces(NamedTuple):
 
 
 def resting_forces(mechanism: Mechanism, q: ArrayLike, t: NumberLike) -> RestingForces:
-    """Return the forces in a position of rest (bodies, 3), with the drivers halted at time t (s)."""
+    """Return the forces in a position of rest (bodies, 3), with the drivers halted at time t (s).
+
+    Without gravity, links may have no mass: forces that equilibrium determines do not depend on it.
+    """
+    if mechanism.massless and not has_gravity(mechanism):
+        mechanism = mechanism.with_parameters({f"body.{name}.mass": mechanism.bodies[name].mass for name in mechanism.massless})
     still, q = with_halted_drivers(mechanism, t), np.asarray(q)
     rest = RestingPositions(np.array([t]), q[None], np.zeros((1, *q.shape)))
     at_pins = pin_reactions(still, rest)
     forces = {pin: {body: np.asarray(load)[0].tolist() for body, load in loads.items()} for pin, loads in at_pins.items()}
     effort_of = {name: float(effort[0]) for name, effort in efforts(still, rest).items()}
     return RestingForces(effort_of, forces, unique_pin_forces(still, rest))
+
+
+def has_gravity(mechanism: Mechanism) -> bool:
+    """Return whether links weigh anything; the gravity of the mechanism is concrete."""
+    return bool(np.any(np.asarray(mechanism.gravity) != 0.0))
+
+
+def forces_table(mechanism: Mechanism, q: ArrayLike) -> PrintedTable | None:
+    """Return the table of the forces at rest in a position (bodies, 3); None if nothing acts or a link can move."""
+    is_loaded = bool(mechanism.forces)
+    if not (is_loaded or has_gravity(mechanism)) or analyse(mechanism).degrees_of_freedom != 0:
+        return None
+    if mechanism.massless and has_gravity(mechanism):
+        words = f"{join_names([*mechanism.massless])} without mass: give masses, or the scene gravity = [0, 0]"
+        return PrintedTable(f"forces at rest need weights; {words}", [], ("",)) if is_loaded else None
+    held = resting_forces(mechanism, q, 0.0)
+    loads = [load[:2] for on in held.forces.values() for load in on.values()]
+    scale = float(np.max(np.abs(loads), initial=0.0))
+    rows = [
+        [f"{name} holds by", format_number(x, mechanism.drivers[name].effort_unit), "", ""] for name, x in held.efforts.items()
+    ]
+    for pin, on in held.forces.items():
+        for body, (x, y, _) in on.items():
+            note = "" if held.unique[pin][body] else ", not unique"
+            parts = [format_number(part, scale=scale) for part in (x, y)]
+            rows.append([f"{pin} on {body}", format_number(np.hypot(x, y), "N", scale) + note, *parts])
+    return PrintedTable("forces at rest", rows, ("", "force", "x (N)", "y (N)"))
 
 
 def force_lines(mechanism: Mechanism, held: RestingForces) -> str:

@@ -21,6 +21,7 @@ from udkjax.scene.elements.joints import Revolute
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.tables.checks import SceneError
 from udkjax.statics.equilibrium import equilibrium
+from udkjax.statics.resting_forces import forces_table
 from udkjax.studio.drawn_fixes import drawn_fix
 from udkjax.studio.limits import RefusedError
 from udkjax.studio.shown_runs import duration_of, force_curves, holding_curves
@@ -72,6 +73,8 @@ def answers(mechanism: Mechanism, at: object = None) -> JsonObject:
     motion = kinematics(mechanism, driver, [value], rate=rate)
     lines = [list(line) for line in characteristics(mechanism, driver).lines().items()]
     tables = [*pin_motion(mechanism, motion).counted(count).tables(), centres_table(mechanism, motion, count)]
+    if np.all(motion.reached) and (forces := forces_table(mechanism, np.asarray(motion.q)[0])):
+        tables.insert(0, forces)
     shown = [{"title": x.title, "heads": list(x.heads), "rows": [[str(cell) for cell in row] for row in x.rows]} for x in tables]
     return {"answers": lines, "tables": shown}
 

@@ -8,10 +8,9 @@ import numpy as np
 from jaxtyping import ArrayLike, Float
 
 from udkjax.argument_types import COORDINATES_OF_BODIES
-from udkjax.arrays import ROUNDING
-from udkjax.positions.answers.counting import Count
+from udkjax.positions.answers.counting import DRAWN, Count
 from udkjax.positions.following.kinematics import Kinematics
-from udkjax.printing import PrintedTable, format_number
+from udkjax.printing import PRINTED_AS_ZERO, PrintedTable, format_number
 from udkjax.requirements import concrete_only
 from udkjax.scene.arguments import checked
 from udkjax.scene.elements.bodies import GROUND
@@ -54,9 +53,9 @@ def instant_centres(
     for k, one in enumerate(names):
         for other in names[k + 1 :]:
             ux, uy, omega = motions[one] - motions[other]
-            if abs(omega) > ROUNDING * fastest:
+            if abs(omega) > DRAWN * fastest:
                 found[one, other] = InstantCentre(np.array([-uy, ux]) / omega, False)
-            elif np.hypot(ux, uy) > ROUNDING * speed:
+            elif np.hypot(ux, uy) > DRAWN * speed:
                 found[one, other] = InstantCentre(np.array([-uy, ux]) / np.hypot(ux, uy), True)
     return found
 
@@ -67,7 +66,7 @@ def centres_table(mechanism: Mechanism, motion: Kinematics, counted: Count) -> P
     centres = instant_centres(mechanism, motion.q[0], motion.v[0])
     largest = max((float(np.max(np.abs(place))) for place, at_infinity in centres.values() if not at_infinity), default=0.0)
     for pair, (place, at_infinity) in centres.items():
-        x, y = (format_number(z / size, scale=largest / size) for z in place)
+        x, y = (format_number(z / size, scale=DRAWN / PRINTED_AS_ZERO * largest / size) for z in place)
         direction = format_number(math.degrees(math.atan2(place[1], place[0])), "deg", 360.0)
         rows.append([" and ".join(pair), *((x, y) if not at_infinity else ("at infinity", direction))])
     return PrintedTable("instant centres", rows, ("links", f"x ({unit})", f"y ({unit})"))

@@ -16,6 +16,7 @@ from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.tables.checks import SceneError
 
 FULL_TURN = 2.0 * math.pi
+DRAWN = 1e-10  # relative to the largest: smaller is rounding of a drawing's numbers, which editors write with twelve digits
 
 
 class Count(NamedTuple):

@@ -14,6 +14,7 @@ from udkjax.positions.following.drive import without_drivers
 from udkjax.scene.elements.bodies import GROUND
 from udkjax.scene.elements.joints import Revolute
 from udkjax.scene.mechanism import Mechanism
+from udkjax.wording import plural
 
 LINKS = ("ground", "input", "coupler", "output")
 
@@ -151,10 +152,11 @@ class Mobility(NamedTuple):
     @property
     def words(self) -> str:
         """Both counts, as a course says them."""
-        same = f"{self.counted}, by Gruebler's count of {self.links} links and {self.joints} joints"
+        elements = f"{self.links} links and {plural(self.joints, 'joint')}"
+        same = f"{self.counted}, by Gruebler's count of {elements}"
         if self.true is None or self.true == self.counted:
             return same
-        return f"{self.true}; Gruebler's count of {self.links} links and {self.joints} joints says {self.counted}"
+        return f"{self.true}; Gruebler's count of {elements} says {self.counted}"
 
 
 def mobility(mechanism: Mechanism) -> Mobility:

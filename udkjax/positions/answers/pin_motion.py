@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from udkjax.annotations import NumberLike
 from udkjax.argument_types import HISTORY, NUMBERS_BY_NAME, ArgumentRequirement
 from udkjax.arrays import by_numpy, library_for
-from udkjax.positions.answers.counting import Count
+from udkjax.positions.answers.counting import DRAWN, Count
 from udkjax.positions.assembling.channels import pins_of, point_of_pin
 from udkjax.positions.assembling.coordinates import value_of
 from udkjax.positions.following.drive import Drive, constant_speed, only_driver
@@ -67,7 +67,7 @@ class PinMotion(PrintsTable):
         links = ["link", "angle (deg)", "omega (rad/s)", "alpha (rad/s²)", *(["torque ratio"] if count.is_angle else [])]
         scale = np.array([180 / np.pi, 1.0, 1.0])
         motions = {name: np.asarray(motion) / count.units.size("m") for name, motion in self.pins.items()}
-        least = [PRINTED_AS_ZERO * max([0.0, *(float(np.nanmax(np.abs(x[:, k]))) for x in motions.values())]) for k in range(3)]
+        least = [DRAWN * max([0.0, *(float(np.nanmax(np.abs(x[:, k]))) for x in motions.values())]) for k in range(3)]
         pin_rows = {name: [_pin_row(x, least) for x in motion] for name, motion in motions.items()}
         link_rows: dict[str, np.ndarray] = {name: np.asarray(motion) * scale for name, motion in self.links.items()}
         if len(self.values) == 1:  # over several values, angles are continuous
@@ -95,7 +95,10 @@ class PinMotion(PrintsTable):
         many = len(self.values) > 1
         sizes = np.abs(np.array([row for motion in rows.values() for row in motion]).reshape(-1, len(heads) - 1))
         largest = np.max(sizes, axis=0, initial=0.0, where=np.isfinite(sizes))
-        scales = [360.0 if "deg" in head else 0.0 if "ratio" in head else x for head, x in zip(heads[1:], largest, strict=True)]
+        scales = [
+            360.0 if "deg" in head else 0.0 if "ratio" in head else DRAWN / PRINTED_AS_ZERO * x
+            for head, x in zip(heads[1:], largest, strict=True)
+        ]
         cells = [
             [name, *([count.number(value)] if many else []), *map(_cell, row, scales)]
             for name, motion in rows.items()
@@ -113,7 +116,7 @@ def _pin_row(motion: Float[np.ndarray, "3 2"], least: Sequence[float]) -> list[f
 
 def _ratio(rate: np.ndarray, omega: np.ndarray) -> np.ndarray:
     """Return the rates of a driver and a link as a ratio, infinite where the link stands still."""
-    still = np.abs(omega) <= PRINTED_AS_ZERO * np.abs(rate)
+    still = np.abs(omega) <= DRAWN * np.abs(rate)
     return np.where(still, np.inf, rate / np.where(still, 1.0, omega))
 
 

@@ -3,7 +3,7 @@
 // A target is the beginning or the end of a gesture: {place} in metres, with the `pin`, or the `link` and the `slide` (indices), under it.
 
 import {addPin, freshName, groundOf, list, members, nameOf, placeOf, project, movePin, withElement, withEntry, toggleGround} from "./document.js";
-import {addPinToLink} from "./joining.js";
+import {addPinToLink, loosePins} from "./joining.js";
 import {centrePin, corners} from "./shapes.js";
 import {angleUnit, lengthUnit, niceBelow, tidy, written} from "./units.js";
 
@@ -132,7 +132,8 @@ export function drawSlide(document, from, to, {size}) {
 
 export function drawSlot(document, from, to) {
   if (!from.pin) return {problem: "a slot guides a pin along a line: drag from a pin in that direction, or onto the link with the slot"};
-  const on = to.link !== undefined && to.link !== null ? list(document, "link")[to.link] : null;
+  const under = to.pin && loosePins(document).find(({pin, link}) => pin === from.pin && list(document, "link")[link].pins.includes(to.pin));  // along a bar, to its end
+  const on = list(document, "link")[under ? under.link : to.link ?? -1] ?? null;
   let found = document, line;
   const own = members(document, from.pin).filter(name => name !== "ground");
   if (on && on.pins.length > 1 && !on.pins.includes(from.pin)) {

@@ -1,8 +1,8 @@
 // Dimensions on the drawing, as in one on paper: lengths of bars, lengths and angles by which pins are given, and where supports and
 // lines of slides are. A click on one opens a field in its place.
 
-import {lengthOf, offsetOf, withLine, withPinNumber, withTypedBar} from "./dimensions.js";
-import {groundOf, list, pinsOf, placeOf} from "./document.js";
+import {bars, lengthOf, offsetOf, withLine, withPinNumber, withTypedBar} from "./dimensions.js";
+import {groundOf, pinsOf, placeOf} from "./document.js";
 import {angle, angleName, angleUnit, expressed, length, lengthUnit, readMeasure, tidy, usesNumbers, written} from "./units.js";
 import {axisOf, placesOf} from "./pin_forms.js";
 import {valueText} from "./values.js";
@@ -31,10 +31,9 @@ const lengthMark = (document, key, from, to, typed, take) => {
 
 /** The dimensions of a drawing: {key, kind, words, typed, take}; `take` returns the drawing in which a text takes the place of `typed`. */
 export function marksOf(document) {
-  const bars = list(document, "link").filter(({pins}) => pins?.length === 2 && pins.every(pin => placeOf(document, pin)));
-  const found = bars.map(link => lengthMark(document, `link ${link.name}`, ...link.pins.map(pin => placeOf(document, pin)), lengthOf(document, link)?.value,
+  const all = bars(document), found = all.map(link => lengthMark(document, `link ${link.name}`, ...link.pins.map(pin => placeOf(document, pin)), lengthOf(document, link)?.value,
     text => withTypedBar(document, link, text, "length")));
-  const isBar = (a, b) => bars.some(({pins}) => pins.includes(a) && pins.includes(b));
+  const isBar = (a, b) => all.some(({pins}) => pins.includes(a) && pins.includes(b));
   for (const [name, value] of Object.entries(pinsOf(document))) {
     const at = placeOf(document, name);
     if (at && value && !Array.isArray(value)) found.push(...formMarks(document, name, value, at, isBar));

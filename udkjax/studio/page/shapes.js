@@ -59,6 +59,12 @@ export function linkShape(document, link) {
   return {kind: closed ? "plate" : "line", points};
 }
 
+/** The pins of a bar in their order along it; empty for another link. */
+export function barPins(document, link) {
+  const {pins = []} = link, places = pins.map(pin => placeOf(document, pin)), isBar = pins.length === 2 || (pins.length > 2 && link.width !== undefined && link.inertia === undefined && !link.outline);
+  return isBar && places.every(Boolean) ? alongLine(places).map(place => pins[places.indexOf(place)]) : [];
+}
+
 /** Findings about plates whose pins are almost in line: as plates they have hardly any mass. */
 export function thinPlates(document) {
   return list(document, "link").flatMap(link => {

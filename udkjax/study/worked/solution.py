@@ -21,7 +21,7 @@ from udkjax.scene.arguments import checked
 from udkjax.scene.elements.bodies import GROUND
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.tables.checks import SceneError
-from udkjax.statics import resting_forces
+from udkjax.statics.resting_forces import has_gravity, resting_forces
 from udkjax.study.worked.equations import LoopSolution, PositionRates, PositionSymbols, solution_of
 from udkjax.study.worked.figures import PolygonSide
 from udkjax.study.worked.loops import Geometry, drawing_of, loops_of
@@ -96,7 +96,7 @@ def worked_solution(mechanism: Mechanism, at: NumberLike | str, digits: int = 6,
         mechanism: a drawn mechanism with one motor: of a link about a pin of the ground, or of a slide on the ground.
         at: the value of the motor, in the unit of the drawing, or a text with a unit, such as "40 deg".
         digits: significant digits of printed numbers.
-        forces: whether to add the static equilibrium of each link, if there are loads and each link has a mass.
+        forces: whether to add the static equilibrium of each link, if there are loads and each link has a mass, or no weight.
 
     Returns:
         The `WorkedSolution`.
@@ -128,7 +128,7 @@ def worked_solution(mechanism: Mechanism, at: NumberLike | str, digits: int = 6,
     dyads, together = loops_of(geometry)
     solved = [solution_of(symbols, [loop]) for loop in dyads] + ([solution_of(symbols, together)] if together else [])
     polygons = _polygon(geometry, motion, 1), _polygon(geometry, motion, 2)
-    balances = _balances(mechanism, geometry, q) if forces and not mechanism.massless else {}
+    balances = _balances(mechanism, geometry, q) if forces and (not mechanism.massless or not has_gravity(mechanism)) else {}
     title = f"{mechanism.name or 'mechanism'}, {motion.title()}"
     return WorkedSolution(title, solved, motion, polygons, balances, NumberStyle(count.units, digits), geometry, symbols)
 
