@@ -82,23 +82,46 @@ EXERCISES = {
 }
 
 
+TERNARY = {"D": (100, 40), "E": (130, 80), "F": (170, 50), "P": (130, -20), "O": (0, 0), "A": udk.polar("O", 20, 70)}
+
+
+def triad(links, ground="", pins=None, **more):
+    """A ternary link on three legs: the rod from the crank, a rocker, and one given by `links` or a slot."""
+    legs = {"crank": "OA", "rod": "AD", "plate": "DEF", "rocker": "PE"} | links
+    shaped = {1: {"width": 20}}
+    tables = {name: {"pins": list(ends), "mass": 1, **shaped.get(len(ends), {})} for name, ends in legs.items()}
+    pins = TERNARY | (pins or {})
+    return udk.Drawing(pins, tables, list(f"OP{ground}"), motors=[TURNS], units=MM, gravity=(0, 0), **more).mechanism()
+
+
+LEG = {"pins": {"Q": (190, -50)}, "ground": "Q"}
+BLOCK = {"pins": {"Q": (190, -50), "R": (260, 30)}, "ground": "Q", "slides": [{"link": "block", "direction": [1, 0]}]}
+TRIADS = {  # with the numbers of loops that are solved together
+    "triad": (lambda: triad({"leg": "FQ"}, **LEG), "100 deg", [2]),
+    "triad with a slot": (lambda: triad({}, slots=[{"pin": "F", "direction": [2, 1]}]), "100 deg", [2]),
+    "triad and a slider": (lambda: triad({"leg": "FQ", "arm": "FR", "block": "R"}, **BLOCK), "100 deg", [2, 1]),
+}
+
+
 @pytest.fixture(scope="module")
 def solutions():
-    return {name: udk.worked_solution(make(), at, digits=15) for name, (make, at, _) in EXERCISES.items()}
+    return {name: udk.worked_solution(make(), at, digits=15) for name, (make, at, _) in (EXERCISES | TRIADS).items()}
 
 
 def value(text: str) -> float:
     return float(evaluate(text, {}, lambda unit: np.pi / 180 if unit == "rad" else 1.0).value)
 
 
-@pytest.mark.parametrize("name", EXERCISES)
+@pytest.mark.parametrize("name", EXERCISES | TRIADS)
 def test_each_printed_line_holds_with_the_printed_numbers(solutions, name):
-    solution = solutions[name]
-    assert len(solution.loops) == EXERCISES[name][2]
+    solution, loops = solutions[name], (EXERCISES | TRIADS)[name][2]
+    assert [len(one.loops) for one in solution.loops] == ([1] * loops if isinstance(loops, int) else loops)
     assert len(solution.lines) > 10 * len(solution.loops)
     for line in solution.lines:
         left, right, *result = line.text(solution.style).split(" = ")
-        if not result:  # a closure: a sum that is zero
+        if line.left is not None and not result:  # a solution alone, which the next lines put in
+            assert float(right.split(" ")[0]) * solution.style.size(line.left.unit) == pytest.approx(line.left.value, rel=HOLDS)
+        elif not result:  # a closure: a sum that is zero
             assert abs(value(left)) <= HOLDS * line.right.scale * 1e3, left
         else:
             found = float(result[0].split(" ")[0])
@@ -134,7 +157,25 @@ def closes(solution, loop: VectorLoop, found) -> list[complex]:
     return vectors
 
 
-@pytest.mark.parametrize("name", EXERCISES)
+@pytest.mark.parametrize("name", TRIADS)
+def test_steps_of_newtons_method_lead_from_an_estimate_to_the_position(solutions, name):
+    one = solutions[name].loops[0]
+    first, *_, last = one.steps
+    assert not one.branches and len(one.steps) in range(4, 8)
+    angles = [x for x, symbol in zip(first.unknowns, one.found, strict=True) if symbol.unit == "rad"]
+    np.testing.assert_allclose(np.degrees(angles) % 10, 0, atol=1e-9)  # as read off a sketch
+    assert all(after.residual < before.residual for before, after in zip(one.steps[:-2], one.steps[1:-1], strict=True))
+    np.testing.assert_allclose(last.unknowns, [symbol.value for symbol in one.found], rtol=HOLDS)
+    residual = [abs(sum(closes(solutions[name], loop, _named(one, first.unknowns)))) for loop in one.loops]
+    assert max(residual) / np.sqrt(2) <= first.residual * (1 + HOLDS) <= max(residual) * (1 + 2 * HOLDS)
+    assert "residual (mm)" in str(solutions[name]) and "read off a sketch" in solutions[name].html()
+
+
+def _named(one, values):
+    return {symbol.name: value for symbol, value in zip(one.found, values, strict=True)}
+
+
+@pytest.mark.parametrize("name", EXERCISES | TRIADS)
 def test_systems_have_the_rates_of_the_kinematics_as_solution(solutions, name):
     for one in solutions[name].loops:
         for system in (one.velocity, one.acceleration):

@@ -15,6 +15,8 @@ from udkjax.statics.reaction_peaks import pin_reactions as pin_reactions
 from udkjax.statics.reaction_peaks import reaction_peaks as reaction_peaks
 from udkjax.statics.reaction_peaks import unique_pin_forces as unique_pin_forces
 from udkjax.statics.resting_forces import force_lines as force_lines
+from udkjax.statics.resting_forces import forces_table as forces_table
+from udkjax.statics.resting_forces import has_gravity as has_gravity
 from udkjax.statics.resting_forces import resting_forces as resting_forces
 
 __all__: list[str]

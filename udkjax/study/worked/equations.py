@@ -6,12 +6,14 @@ from typing import NamedTuple
 import numpy as np
 
 from udkjax.scene.elements.bodies import GROUND
+from udkjax.study.worked.iterations import NewtonStep, PositionRates, newton_steps
 from udkjax.study.worked.loops import LoopVector, VectorLoop, wrapped
 from udkjax.study.worked.terms import (
     AppliedFunction,
     EquationLine,
     EquationTerm,
     NamedQuantity,
+    NumberStyle,
     PlainFactor,
     ProductOfTerms,
     RatioOfTerms,
@@ -25,11 +27,7 @@ AXES = ("x", "y")
 NAMES = ("cos", "sin")
 
 
-class PositionRates(NamedTuple):
-    """The motion of one position: angles, and lengths along lines, each with its first and second derivative in time."""
-
-    angles: dict[str, tuple[float, float, float]]  # rad, rad/s, rad/s^2
-    slides: dict[str, tuple[float, float, float]]  # m, m/s, m/s^2
+NO_TERMS = SumOfTerms(())
 
 
 class LinearEquations(NamedTuple):
@@ -46,6 +44,11 @@ class LinearEquations(NamedTuple):
     right: list[EquationLine]
     unknowns: list[NamedQuantity]
     lines: list[EquationLine]
+
+    @property
+    def coefficients(self) -> list[EquationLine]:
+        """The lines of the coefficients without those that are zero by structure."""
+        return [line for row in self.matrix for line in row if line.right != NO_TERMS]
 
 
 class PositionSymbols:
@@ -316,7 +319,8 @@ def _linear(symbols: PositionSymbols, loops: Sequence[VectorLoop], order: int, k
             term = total(*((-sign, part) for x in loop.vectors for sign, part in known(x, axis)))
             letter, unit = (("b", "m/s"), ("c", "m/s2"))[order - 1]
             right.append(EquationLine(term, NamedQuantity(letter, f"{row}", term.value, unit)))
-    return LinearEquations(matrix, right, unknowns, _cramer(matrix, right, unknowns) if len(unknowns) == 2 else [])
+    solve_system = _cramer if len(unknowns) == 2 else _put_in
+    return LinearEquations(matrix, right, unknowns, solve_system(matrix, right, unknowns))
 
 
 def _of_angle(symbols: PositionSymbols, loop: VectorLoop, body: str, axis: int) -> SumOfTerms:
@@ -384,6 +388,15 @@ def _cramer(matrix: list[list[EquationLine]], right: list[EquationLine], unknown
     return [line, *(EquationLine(RatioOfTerms(x, det), unknown) for x, unknown in zip(above, unknowns, strict=True))]
 
 
+def _put_in(matrix: list[list[EquationLine]], right: list[EquationLine], unknowns: list[NamedQuantity]) -> list[EquationLine]:
+    """Return the solution of more equations, and each of them with it put in."""
+    rows = [
+        total(*((1.0, ProductOfTerms((_left(a), x))) for a, x in zip(row, unknowns, strict=True) if a.right != NO_TERMS))
+        for row in matrix
+    ]
+    return [*(EquationLine(x, x) for x in unknowns), *(EquationLine(row, _left(b)) for row, b in zip(rows, right, strict=True))]
+
+
 def _left(line: EquationLine) -> NamedQuantity:
     assert line.left is not None
     return line.left
@@ -400,6 +413,7 @@ class LoopSolution(NamedTuple):
         closures: the two components of the closure of each.
         shared: lines of the positions that all branches share.
         branches: the positions of the unknowns; empty if they follow by iteration alone.
+        steps: those of Newton's method then, from an estimate.
         found: the unknowns in this position.
         velocity, acceleration: the linear systems of their derivatives.
     """
@@ -408,9 +422,20 @@ class LoopSolution(NamedTuple):
     closures: list[EquationLine]
     shared: list[EquationLine]
     branches: list[BranchPosition]
+    steps: list[NewtonStep]
     found: list[NamedQuantity]
     velocity: LinearEquations
     acceleration: LinearEquations
+
+    def step_rows(self, style: NumberStyle) -> list[list[str]]:
+        """Return the table of the steps of Newton's method, with its heads; empty if there are none."""
+        heads = [f"{x.name} ({style.unit(x.unit)})" for x in self.found]
+        rows = [
+            [str(k), *(style.number(value, x.unit) for value, x in zip(step.unknowns, self.found, strict=True)),
+             f"{step.residual / style.size('m'):.2g}"]
+            for k, step in enumerate(self.steps)
+        ]  # fmt: skip
+        return [["step", *heads, f"residual ({style.unit('m')})"], *rows] if rows else []
 
 
 def solution_of(symbols: PositionSymbols, loops: list[VectorLoop]) -> LoopSolution:
@@ -421,4 +446,5 @@ def solution_of(symbols: PositionSymbols, loops: list[VectorLoop]) -> LoopSoluti
     found = [symbols.angle(body) for loop in loops for body in loop.angles]
     found += [symbols.length(lines_of[slide]) for loop in loops for slide in loop.slides]
     systems = velocity_system(symbols, loops), acceleration_system(symbols, loops)
-    return LoopSolution(loops, closures, shared, branches, found, *systems)
+    steps = [] if branches else newton_steps(loops, symbols.rates)
+    return LoopSolution(loops, closures, shared, branches, steps, found, *systems)

@@ -1,5 +1,6 @@
 """The vector loops of a drawing: closed chains of vectors from pin to pin, in an order in which each has two unknowns."""
 
+import itertools
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -16,6 +17,7 @@ from udkjax.wording import quote
 
 NOTHING = 1e-9  # relative to the extent of the pins: vectors and offsets that are shorter are left out
 TURN = 2 * np.pi
+MOST_SEARCHED = 16  # bodies of which groups are looked for; there are 2^16
 
 
 class Connection(NamedTuple):
@@ -190,23 +192,39 @@ def _connections(mechanism: Mechanism, drawing: Drawing) -> Iterator[Connection]
             raise SceneError([f"a worked solution has pins, slides and slots; {kind}"], mechanism.name)
 
 
-def loops_of(geometry: Geometry) -> tuple[list[VectorLoop], list[VectorLoop]]:
-    """Return the loops that determine two unknowns each, one after the other, and those that are left, to be solved together."""
+def loops_of(geometry: Geometry) -> list[list[VectorLoop]]:
+    """Return the loops in an order in which each determines two unknowns; where none does, the fewest that do so together."""
     known_bodies, known_slides = _driven(geometry)
     bodies, found = list(geometry.mechanism.body_names), []
     used = {joint.name for joint in geometry.connections if set(joint.bodies) <= known_bodies}
     while not set(bodies) <= known_bodies:
-        paths = list(_paths(geometry, known_bodies))
-        rated = [(path, *_unknowns(geometry, path, known_bodies, known_slides)) for path in paths]
-        dyads = [one for one in rated if len(one[1]) + len(one[2]) == 2]
-        if not dyads:
-            return found, _together(geometry, known_bodies, known_slides, used)
-        path, angles, slides = min(dyads, key=lambda one: len(one[0]))
-        found.append(VectorLoop(_closed(geometry, path, known_bodies, used), angles, slides))
-        known_bodies |= {body for body, _ in path}
-        known_slides |= set(slides)
-        used |= {joint.name for _, joint in path}
-    return found, []
+        rated = [
+            (path, *_unknowns(geometry, path, known_bodies, known_slides)) for path in _paths(geometry, known_bodies, {*bodies})
+        ]
+        if dyads := [one for one in rated if len(one[1]) + len(one[2]) == 2]:
+            path, angles, slides = min(dyads, key=lambda one: len(one[0]))
+            loops = [VectorLoop(_closed(geometry, path, known_bodies, used), angles, slides)]
+            known_bodies |= {body for body, _ in path}
+            used |= {joint.name for _, joint in path}
+        else:
+            group = _smallest_group(geometry, known_bodies)
+            loops = _together(geometry, known_bodies, known_slides, used, group)
+            known_bodies |= group
+            used |= {joint.name for joint in geometry.connections if group & {*joint.bodies} and {*joint.bodies} <= known_bodies}
+        found.append(loops)
+        known_slides |= {slide for loop in loops for slide in loop.slides}
+    return found
+
+
+def _smallest_group(geometry: Geometry, known: set[str]) -> set[str]:
+    """Return the fewest bodies that their joints among each other and to known ones hold, an Assur group; or all, of many."""
+    unknown = [body for body in geometry.mechanism.body_names if body not in known]
+    for count in range(2, len(unknown) if len(unknown) <= MOST_SEARCHED else 2):
+        for group in map(set, itertools.combinations(unknown, count)):
+            own = [joint for joint in geometry.connections if group & {*joint.bodies} and {*joint.bodies} <= group | known]
+            if 3 * count == sum(2 - (joint.slides and joint.turns) for joint in own):
+                return group
+    return {*unknown}
 
 
 def _driven(geometry: Geometry) -> tuple[set[str], set[str]]:
@@ -227,8 +245,8 @@ def _driven(geometry: Geometry) -> tuple[set[str], set[str]]:
 BodyPath = list[tuple[str, Connection]]  # bodies, each with the joint by which the path leaves it; the first body is known
 
 
-def _paths(geometry: Geometry, known: set[str]) -> Iterator[BodyPath]:
-    """Iterate over the chains of unknown bodies between two joints of known ones."""
+def _paths(geometry: Geometry, known: set[str], allowed: set[str]) -> Iterator[BodyPath]:
+    """Iterate over the chains of allowed unknown bodies between two joints of known ones."""
 
     def onward(path: BodyPath, body: str) -> Iterator[BodyPath]:
         visited = {name for name, _ in path}
@@ -239,7 +257,7 @@ def _paths(geometry: Geometry, known: set[str]) -> Iterator[BodyPath]:
             if after in known:
                 if path:
                     yield [*path, (body, joint)]
-            elif after not in visited:
+            elif after in allowed and after not in visited:
                 yield from onward([*path, (body, joint)], after)
 
     for body in sorted(known, key=[*geometry.mechanism.body_names, GROUND].index):
@@ -276,20 +294,21 @@ def _shortest(geometry: Geometry, start: str, goal: str, used: set[str]) -> Body
     raise AssertionError(f"{start} and {goal} are not connected")
 
 
-def _together(geometry: Geometry, known: set[str], slides: set[str], used: set[str]) -> list[VectorLoop]:
-    """Return independent loops of all bodies that no dyad determines, with their unknowns at the first one."""
-    joined, found = set(known), []
-    used, slides = set(used), set(slides)
-    angles: list[str] = []
-    for path in sorted(_paths(geometry, known), key=len):
-        fresh = [joint for _, joint in path if joint.name not in used]
-        bodies = {body for body, _ in path}
-        if not fresh or (bodies <= joined and len(fresh) != 1):
+def _together(geometry: Geometry, known: set[str], slides: set[str], used: set[str], group: set[str]) -> list[VectorLoop]:
+    """Return independent loops of a group of bodies, with their unknowns at the first one."""
+    joined, slides = set(known), set(slides)
+    found: list[VectorLoop] = []
+    basis: dict[int, int] = {}
+    bits = {joint.name: 1 << k for k, joint in enumerate(geometry.connections)}
+    for path in sorted(_paths(geometry, known, group), key=len):
+        rest = sum(bits[joint.name] for _, joint in path)
+        while rest and (top := rest.bit_length()) in basis:  # elimination modulo two
+            rest ^= basis[top]
+        if not rest:
             continue
-        here, sliding = _unknowns(geometry, path, joined, slides)
-        found.append(VectorLoop(_closed(geometry, path, known, used), here, sliding))
-        joined |= bodies
+        basis[rest.bit_length()] = rest
+        angles, sliding = _unknowns(geometry, path, joined, slides)
+        found.append(VectorLoop(_closed(geometry, path, known, used), angles, sliding))
+        joined |= {body for body, _ in path}
         slides |= set(sliding)
-        used |= {joint.name for joint in fresh}
-        angles += here
     return found

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from udkjax.positions.answers.pin_motion import PinMotion
 from udkjax.printing import PrintedTable
-from udkjax.study.worked.equations import LoopSolution
+from udkjax.study.worked.equations import NO_TERMS, LoopSolution
 from udkjax.study.worked.figures import PolygonSide, drawing_figure, polygon_figure
 from udkjax.study.worked.loops import Geometry
 from udkjax.study.worked.terms import EquationLine, NamedQuantity, NumberStyle
@@ -62,7 +62,14 @@ def _loop(solution: LoopSolution, style: NumberStyle, number: str) -> list[str]:
         parts.append("<p>The sum of the known vectors, and the solution:</p>")
         parts += [_equation(line, style) for line in solution.shared]
     else:
-        parts.append("<p>These equations have no closed form: they are solved together, by Newton's method.</p>")
+        parts.append(
+            "<p>These equations have no closed form. Newton's method solves them together, from an estimate read off a sketch: "
+            "in each step, the changes of the unknowns solve a linear system whose matrix is that of the velocities below, and "
+            "whose right sides are the sums above with their signs changed.</p>"
+        )
+        if rows := solution.step_rows(style):
+            parts.append(_table(PrintedTable("", rows[1:], rows[0])))
+        parts.append("<p>The solution:</p>")
         parts += [_equation(EquationLine(symbol, symbol), style) for symbol in solution.found]
     for branch in solution.branches:
         if branch.words:
@@ -72,10 +79,11 @@ def _loop(solution: LoopSolution, style: NumberStyle, number: str) -> list[str]:
     for title, system in (("Velocities", solution.velocity), ("Accelerations", solution.acceleration)):
         parts.append(f"<h2>{title}{f': loop{number}' if number else ''}</h2>")
         parts.append(_system(system.matrix, system.unknowns, system.right, style))
-        coefficients = [line for row in system.matrix for line in row] if system is solution.velocity else []
-        parts += [_equation(line, style) for line in (*coefficients, *system.right, *system.lines)]
-        if not system.lines:
-            parts += [_equation(EquationLine(symbol, symbol), style) for symbol in system.unknowns]
+        coefficients = system.coefficients if system is solution.velocity else []
+        parts += [_equation(line, style) for line in (*coefficients, *system.right)]
+        if len(system.unknowns) > 2:
+            parts.append("<p>Its solution, and the equations with it put in:</p>")
+        parts += [_equation(line, style) for line in system.lines]
     return parts
 
 
@@ -97,10 +105,15 @@ def _system(
         inner = "".join(f"<mtr>{''.join(f'<mtd>{cell}</mtd>' for cell in row)}</mtr>" for row in rows)
         return f"<mrow><mo>[</mo><mtable>{inner}</mtable><mo>]</mo></mrow>"
 
-    cells = [[line.left.mathml(style, False) for line in row if line.left is not None] for row in matrix]
-    sides = [[line.left.mathml(style, False)] for line in right if line.left is not None]
+    cells = [["<mn>0</mn>" if line.right == NO_TERMS else _symbol(line, style) for line in row] for row in matrix]
+    sides = [[_symbol(line, style)] for line in right]
     parts = column(cells) + column([[x.mathml(style, False)] for x in unknowns]) + "<mo>=</mo>" + column(sides)
     return f'<div class="equation"><math displaystyle="true"><mrow>{parts}</mrow></math></div>'
+
+
+def _symbol(line: EquationLine, style: NumberStyle) -> str:
+    assert line.left is not None
+    return line.left.mathml(style, False)
 
 
 def _table(table: PrintedTable) -> str:

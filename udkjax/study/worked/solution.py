@@ -15,15 +15,16 @@ from udkjax.positions.answers.pin_motion import PinMotion, pin_motion, usual_rat
 from udkjax.positions.assembling.coordinates import element_of, value_of
 from udkjax.positions.following.drive import only_driver
 from udkjax.positions.following.kinematics import kinematics
-from udkjax.printing import PRINTED_AS_ZERO
+from udkjax.printing import PRINTED_AS_ZERO, align_columns
 from udkjax.requirements import concrete_only
 from udkjax.scene.arguments import checked
 from udkjax.scene.elements.bodies import GROUND
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.tables.checks import SceneError
 from udkjax.statics.resting_forces import has_gravity, resting_forces
-from udkjax.study.worked.equations import LoopSolution, PositionRates, PositionSymbols, solution_of
+from udkjax.study.worked.equations import LoopSolution, PositionSymbols, solution_of
 from udkjax.study.worked.figures import PolygonSide
+from udkjax.study.worked.iterations import PositionRates
 from udkjax.study.worked.loops import Geometry, drawing_of, loops_of
 from udkjax.study.worked.page import page_of
 from udkjax.study.worked.terms import EquationLine, EquationTerm, NamedQuantity, NumberStyle, ProductOfTerms, total
@@ -59,7 +60,7 @@ class WorkedSolution:
         found: list[EquationLine] = []
         for one in self.loops:
             found += [*one.closures, *one.shared, *(line for branch in one.branches for line in branch.lines)]
-            found += [line for row in one.velocity.matrix for line in row]
+            found += one.velocity.coefficients
             for system in (one.velocity, one.acceleration):
                 found += [*system.right, *system.lines]
         return [*found, *(line for balance in self.balances.values() for line in balance)]
@@ -70,7 +71,8 @@ class WorkedSolution:
         return max((line.residual for line in self.lines), default=0.0)
 
     def __str__(self) -> str:
-        return "\n".join([self.title, *("  " + line.text(self.style) for line in self.lines)])
+        steps = [row for one in self.loops for row in one.step_rows(self.style)]
+        return "\n".join([self.title, *("  " + line.text(self.style) for line in self.lines), *align_columns(steps)])
 
     def __repr__(self) -> str:
         return f"WorkedSolution({self.title!r}, {len(self.lines)} equations)"
@@ -125,8 +127,7 @@ def worked_solution(mechanism: Mechanism, at: NumberLike | str, digits: int = 6,
     pins = {joint.name: joint.pin for joint in geometry.connections}
     symbols = PositionSymbols(PositionRates(angles, slides), pins)
     motion = pin_motion(mechanism, found).counted(count)
-    dyads, together = loops_of(geometry)
-    solved = [solution_of(symbols, [loop]) for loop in dyads] + ([solution_of(symbols, together)] if together else [])
+    solved = [solution_of(symbols, loops) for loops in loops_of(geometry)]
     polygons = _polygon(geometry, motion, 1), _polygon(geometry, motion, 2)
     balances = _balances(mechanism, geometry, q) if forces and (not mechanism.massless or not has_gravity(mechanism)) else {}
     title = f"{mechanism.name or 'mechanism'}, {motion.title()}"

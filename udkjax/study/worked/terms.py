@@ -306,23 +306,25 @@ class EquationLine(NamedTuple):
             return f"{right} = 0"
         unit = "" if self.left.unit in PLAIN else f" {style.unit(self.left.unit)}"
         result = f" = {style.number(self.left.value, self.left.unit)}{unit}" if numbers else ""
+        if self.right is self.left:  # a value alone
+            return f"{self.left.name}{result}"
         return f"{self.left.name} = {right}{result}"
 
-    def _pieces(self, style: NumberStyle) -> list[str]:
-        """Return the right side with numbers, a piece for each term of a sum."""
+    def _pieces(self, style: NumberStyle, numbers: bool, before: str = "") -> list[str]:
+        """Return the right side with numbers or symbols, a piece for each term of a sum."""
         if not isinstance(self.right, SumOfTerms):
-            return [f"<mo>=</mo>{self.right.mathml(style, True)}"]
+            return [f"{before}{self.right.mathml(style, numbers)}"]
         pieces = []
         for k, (sign, term) in enumerate(self.right.parts):
             mark = "<mo>−</mo>" if sign < 0 else "<mo>+</mo>" if k else ""
-            pieces.append(f"{'<mo>=</mo>' if k == 0 else ''}{mark}{_grouped(term, style, True)}")
+            pieces.append(f"{before if k == 0 else ''}{mark}{_grouped(term, style, numbers)}")
         return pieces
 
     def mathml(self, style: NumberStyle) -> str:
         """Return the equation as MathML: by symbols, with numbers put in, and its value with its unit."""
-        steps = [self.right.mathml(style, False), self.right.mathml(style, True)]
         if self.left is None:
-            return _math("<mo>=</mo>".join([steps[0], "<mn>0</mn>"])) + _math("<mo>=</mo>".join([steps[1], "<mn>0</mn>"]))
+            return "".join(_wrapped([*self._pieces(style, numbers), "<mo>=</mo><mn>0</mn>"]) for numbers in (False, True))
+        steps = [self.right.mathml(style, False), self.right.mathml(style, True)]
         unit = style.unit(self.left.unit)
         shown = _number(style.number(self.left.value, self.left.unit), unit if unit == "°" else "")
         shown += f'<mspace width="0.25em"></mspace><mtext>{escape(unit)}</mtext>' if unit not in (*PLAIN, "°") else ""
@@ -330,8 +332,11 @@ class EquationLine(NamedTuple):
         if steps[-1] == shown:
             steps = steps[:-1]
         left = self.left.mathml(style, False)
+        if self.right is self.left:  # a value alone
+            return _math(f"{left}<mo>=</mo>{shown}")
         if len(steps) == 2 and len(self.text(style)) > LONGEST_LINE:  # by symbols, and below it with numbers
-            return _math(f"{left}<mo>=</mo>{steps[0]}") + _wrapped([*self._pieces(style), f"<mo>=</mo>{shown}"])
+            with_numbers = [*self._pieces(style, True, "<mo>=</mo>"), f"<mo>=</mo>{shown}"]
+            return _wrapped(self._pieces(style, False, f"{left}<mo>=</mo>")) + _wrapped(with_numbers)
         return _math("<mo>=</mo>".join([left, *steps, shown]))
 
 
