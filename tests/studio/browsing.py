@@ -13,11 +13,13 @@ PATIENCE = 120.0  # s: time for the server to compile and diagnose on a busy mac
 
 
 WATCH = """(() => {
-    const {canvas, parts} = studio, draw = canvas.draw.bind(canvas), watched = window.watched = {answers: [], longest: 0};
+    const {canvas, parts} = studio, draw = canvas.draw.bind(canvas);
+    const watched = window.watched = {answers: [], longest: 0, frames: 0};
     let waiting = null;
     parts.canvas.addEventListener("pointermove", event => { waiting ??= event.timeStamp; }, true);
     canvas.draw = shown => {
         draw(shown);
+        watched.frames += 1;
         if (waiting !== null) watched.answers.push(performance.now() - waiting);
         waiting = null;
     };

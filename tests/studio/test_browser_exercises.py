@@ -86,9 +86,16 @@ def numbers(words):
     return [float(word) for word in words.replace(",", " ").split() if word.lstrip("-")[:1].isdigit()]
 
 
+def drawing(text):
+    """Return the drawing of a file."""
+    found = udk.loads(text).drawing
+    assert isinstance(found, udk.Drawing)
+    return found
+
+
 def lengths(text):
     """Return the lengths (mm) in a file, by link."""
-    found = udk.loads(text).drawing.lengths()
+    found = drawing(text).lengths()
     return {name: [1e3 * float(x) for x in sides.values()] for name, sides in found.items()}
 
 
@@ -202,7 +209,7 @@ def test_the_screw_of_a_scissor_jack(studio):
     jack = udk.loads(text)
     masses = {name: float(body.mass) for name, body in jack.bodies.items()}
     lifted = 1000 + 9.81 * (masses["link3"] + (masses["link1"] + masses["link2"]) / 2)
-    foot, height = (float(jack.drawing.pins[pin][axis]) for pin, axis in (("C", 0), ("D", 1)))
+    foot, height = (float(drawing(text).pins[pin][axis]) for pin, axis in (("C", 0), ("D", 1)))
     screw, _, _ = hand.table("forces at rest")["motor1 holds by"]
     assert numbers(screw)[0] == pytest.approx(-lifted * foot / height, rel=1e-5)
 
@@ -296,7 +303,7 @@ def test_the_cylinder_of_a_boom(studio):
     found, text = hand.answers()
     assert hand.acts <= 16
     assert sorted(lengths(text)["link1"]) == pytest.approx([100, 110, 210], rel=1e-9)
-    pins = {name: [1e3 * float(x) for x in place] for name, place in udk.loads(text).drawing.pins.items()}
+    pins = {name: [1e3 * float(x) for x in place] for name, place in drawing(text).pins.items()}
     (foot, head), end = (pins[name] for name in ("C", "D")), pins["B"]
     apart, arm = math.hypot(*foot), math.hypot(*head)
     limits = [numbers(part)[0] for part in found["driver"].split("toggles at ")[1].split(" and ")]

@@ -413,7 +413,7 @@ class LoopSolution(NamedTuple):
         closures: the two components of the closure of each.
         shared: lines of the positions that all branches share.
         branches: the positions of the unknowns; empty if they follow by iteration alone.
-        steps: those of Newton's method then, from an estimate.
+        steps: steps of Newton's method from an estimate, where there is no closed form.
         found: the unknowns in this position.
         velocity, acceleration: the linear systems of their derivatives.
     """
