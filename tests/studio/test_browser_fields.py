@@ -134,7 +134,7 @@ def test_the_crank_goes_to_an_angle_and_several_curves_are_shown_over_it(studio)
     low, high = studio.js("studio.curves.along.range")
     assert high - low == pytest.approx(720) and low == pytest.approx(60)  # two turns from the drawn position
     box = studio.page.locator(".strip canvas").bounding_box()
-    studio.page.mouse.click(box["x"] + 58 + (box["width"] - 70) / 2, box["y"] + 60)
+    studio.page.mouse.click(box["x"] + 58 + (box["width"] - 120) / 2, box["y"] + 60)  # a speed and an angle: two axes
     studio.page.wait_for_timeout(60)
     assert studio.js("studio.motion.t") == pytest.approx(1.0, abs=0.01)
     studio.page.get_by_role("button", name="show one curve alone").click()

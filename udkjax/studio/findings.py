@@ -74,7 +74,7 @@ def answers(mechanism: Mechanism, at: object = None) -> JsonObject:
     lines = [list(line) for line in characteristics(mechanism, driver).lines().items()]
     tables = [*pin_motion(mechanism, motion).counted(count).tables(), centres_table(mechanism, motion, count)]
     if np.all(motion.reached) and (forces := forces_table(mechanism, np.asarray(motion.q)[0])):
-        tables.insert(0, forces)
+        tables.insert(2, forces)
     shown = [{"title": x.title, "heads": list(x.heads), "rows": [[str(cell) for cell in row] for row in x.rows]} for x in tables]
     return {"answers": lines, "tables": shown}
 
