@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 import udkjax as udk
+from tests.contrast import CONTRAST, LEAST_CONTRAST
+from tests.studio.browsing import studio_page
 
 FOUR_BAR = """format = 2
 units = {length = "mm", angle = "deg"}
@@ -191,3 +193,39 @@ def test_a_sheet_is_printed_with_drawing_and_answers(studio):
     assert studio.js("document.querySelectorAll('.print-sheet').length") == 0
     studio.page.emulate_media(media="screen", color_scheme="light")
     assert not studio.problems
+
+
+SIZES = {"laptop": (1280, 800), "small": (800, 600), "phone": (390, 844)}
+# Texts and fields that stick out of the page or of the bar in which they are; dimensions whose texts share pixels.
+CUT_OFF = """(() => {
+    const bars = ["header", ".strip-bar", "footer", ".answers dl"].map(kind => document.querySelector(kind)), wide = [];
+    for (const bar of bars) for (const one of bar.children) {
+        const box = one.getBoundingClientRect(), {left, right} = bar.parentElement.getBoundingClientRect();
+        const isOut = box.right > Math.min(right, innerWidth) + 1 || box.left < left - 1;
+        if (box.width && isOut) wide.push(one.outerHTML.slice(0, 60));
+    }
+    const boxes = studio.dimensions.boxes.map(({mark, box}) => [mark.key, ...box]);
+    boxes.forEach(([name, left, top, right, bottom], k) => boxes.slice(0, k).forEach(([other, a, b, c, d]) => {
+        const [across, along] = [Math.min(right, c) - Math.max(left, a), Math.min(bottom, d) - Math.max(top, b)];
+        if (across > 2 && along > 2) wide.push(`${name} on ${other}`);
+    }));
+    return wide;
+})()"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_nothing_is_cut_off_beside_the_answers_and_text_has_contrast(browser, server, scheme):
+    address, folder = server
+    for name, size in SIZES.items():
+        with studio_page(browser, address, folder, *size, color_scheme=scheme) as studio:
+            for template in ("quick_return", "toggle_press"):
+                studio.js(f"studio.files.openTemplate('{template}')")
+                studio.settle()
+                studio.until("studio.motion.run?.count > 1 && studio.answers.element.querySelectorAll('dt').length > 0")
+                studio.page.keyboard.press("f")
+                studio.settle()
+                assert studio.js(CUT_OFF) == [], (name, template)
+                assert studio.js("studio.curves.canvas.clientHeight") > 100, name
+                found = studio.js(CONTRAST)
+                assert found["ratio"] >= LEAST_CONTRAST, (name, found)

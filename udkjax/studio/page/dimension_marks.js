@@ -10,8 +10,8 @@ import {toPixels} from "./view.js";
 import {make} from "./player/elements.js";
 
 const AWAY = 22, FARTHER = 40;  // px from a bar to its dimension, and from supports to theirs
-const LEVELS = [0, 18, 36], SHARES = [0.5, 0.35, 0.65];  // px: how much farther; and where on its line the text of a dimension may be
-const GAP = 4, HEAD = 6, RADIUS = 34, SIZE = 11;  // px: before an extension line, of arrowheads, of an angle's arc, of its text
+const LEVELS = [0, 18, 36, 54, 72], SHARES = [0.5, 0.35, 0.65];  // px: how much farther; and where on its line the text of a dimension may be
+const GAP = 4, HEAD = 6, RADIUS = 34, SIZE = 11, LETTER = 3.2;  // px: before an extension line, of arrowheads, of an angle's arc, of its text, and half a letter
 const ZERO = 1e-9;  // fraction of the drawing's extent: supports that are closer in a coordinate are level
 
 const minus = (a, b) => [a[0] - b[0], a[1] - b[1]], plus = (a, b, s = 1) => [a[0] + s * b[0], a[1] + s * b[1]];
@@ -188,14 +188,15 @@ export class DimensionMarks {
   }
 
   /** The forms of an angle, from its axis to its arm: nearer to the pin first. */
-  arcs({at, axis, by}) {
+  arcs({at, axis, by, words}) {
     const centre = toPixels(this.studio.view, at);
-    return LEVELS.map(level => {
+    return LEVELS.flatMap(level => SHARES.map(share => {
       const radius = RADIUS + level, on = (turn, far = radius) => [centre[0] + far * Math.cos(turn), centre[1] - far * Math.sin(turn)], end = axis + by;
       const back = [Math.sin(end), Math.cos(end)].map(x => Math.sign(by || 1) * x), isOpen = Math.abs(by) * radius > 2 * HEAD;
-      return {at: on(axis + by / 2, radius + 14), lines: [{points: [centre, on(axis, radius + 8)], width: 0.8, colour: "line"}], heads: isOpen ? [head(on(end), back)] : [],
+      const turn = axis + by * share, room = 6 + LETTER * words.length * Math.abs(Math.cos(turn)) + SIZE / 2 * Math.abs(Math.sin(turn));
+      return {at: on(turn, radius + room), lines: [{points: [centre, on(axis, radius + 8)], width: 0.8, colour: "line"}], heads: isOpen ? [head(on(end), back)] : [],
         arc: {centre, radius, from: axis, to: end}};
-    });
+    }));
   }
 }
 

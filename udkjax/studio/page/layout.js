@@ -3,6 +3,14 @@
 import {KEYS, TOOLS} from "./tools.js";
 import {VECTORS} from "./vectors.js";
 import {button, icon, keepKeys, make, svgIcon} from "./player/elements.js";
+import {THEMES} from "./player/painter.js";
+
+/** Give an element the colours of a theme, by its name. */
+export function wear(element, theme) {
+  const {back, panel, ink, soft, line, accent, onAccent, force} = THEMES[theme];
+  for (const [name, value] of Object.entries({back, panel, ink, soft, line, accent, force, "on-accent": onAccent})) element.style.setProperty(`--${name}`, value);
+  element.style.colorScheme = theme;
+}
 
 const ICONS = {
   undo: "M9 5L4 10l5 5v-3.5h5a3.5 3.5 0 0 1 0 7H9v2h5a5.5 5.5 0 0 0 0-11H9z", redo: "M15 5l5 5-5 5v-3.5h-5a3.5 3.5 0 0 0 0 7h5v2h-5a5.5 5.5 0 0 1 0-11h5z",

@@ -1,5 +1,6 @@
 // The sheet that the browser prints: the drawing with its dimensions, the curves, and the answers; in the light theme.
 
+import {wear} from "./layout.js";
 import {make} from "./player/elements.js";
 
 export function followPrinting(studio, root) {
@@ -21,6 +22,8 @@ function sheetOf(studio) {
     .map(([canvas, title]) => make("figure", {}, make("img", {src: canvas.toDataURL("image/png"), alt: title}), ...(canvas === parts.canvas ? [] : [make("figcaption", {}, title)])));
   studio.chosenTheme = chosenTheme;
   studio.retheme();
-  return make("section", {class: "print-sheet answers"}, make("h1", {}, studio.document.name || parts.title.title), ...pictures,
+  const sheet = make("section", {class: "print-sheet answers"}, make("h1", {}, studio.document.name || parts.title.title), ...pictures,
     make("div", {class: "body"}, ...[...parts.answers.childNodes].map(node => node.cloneNode(true))));
+  wear(sheet, "light");
+  return sheet;
 }

@@ -13,7 +13,7 @@ import {Gestures} from "./gestures.js";
 import {History} from "./history.js";
 import {joinPin, loosePins} from "./joining.js";
 import {followKeys} from "./keys.js";
-import {buildPage} from "./layout.js";
+import {buildPage, wear} from "./layout.js";
 import {Motion} from "./motion.js";
 import {Pictures} from "./pictures.js";
 import {followPrinting} from "./print.js";
@@ -27,7 +27,6 @@ import {fit} from "./view.js";
 import {Vectors} from "./vectors.js";
 import {WantedPath} from "./wanted.js";
 import {make} from "./player/elements.js";
-import {THEMES} from "./player/painter.js";
 
 const NEW_SIZE = 0.25;  // m: width of the view of a new drawing
 const SNAP_PIXELS = 8;  // least spacing of snapping points
@@ -209,9 +208,7 @@ class Studio {
   }
 
   retheme() {
-    const {back, panel, ink, soft, line, accent, onAccent, force} = THEMES[this.theme], root = document.documentElement;
-    for (const [name, value] of Object.entries({back, panel, ink, soft, line, accent, force, "on-accent": onAccent})) root.style.setProperty(`--${name}`, value);
-    root.style.colorScheme = this.theme;
+    wear(document.documentElement, this.theme);
     this.redraw();
   }
 
