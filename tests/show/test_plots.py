@@ -13,6 +13,7 @@ import udkjax as udk
 from udkjax.equations.states.quantities import Energy
 from udkjax.integrate import Result, Solution
 from udkjax.show import plots
+from udkjax.show.figures import driven_figure
 from udkjax.show.plots import farthest_instants, trajectory
 from udkjax.show.style import COLOURS
 from udkjax.study.accuracy import exact_coordinates
@@ -161,6 +162,35 @@ def test_every_drawing_function_labels_its_axes_with_units(linkage, exact):
         axes = Figure().subplots()
         assert draw(axes, *arguments) is axes
         assert axes.get_xlabel().endswith(")") and axes.get_ylabel().endswith(")")
+
+
+def test_plots_of_a_drawing_are_in_its_units_and_count_as_it_does():
+    pins = {"O": (0, 0), "A": udk.polar("O", 50, 60), "C": udk.on_rail("A", 150, "R", (1, 0)), "R": (0, -20)}
+    links = {"crank": {"pins": ["O", "A"]}, "rod": {"pins": ["A", "C"]}, "block": {"pins": ["C"], "width": 20}}
+    mech = udk.Drawing(
+        pins,
+        links,
+        ["O"],
+        motors=[{"pin": "O", "speed": "60 rpm"}],
+        slides=[{"link": "block", "direction": [1, 0]}],
+        units={"length": "mm", "angle": "deg"},
+    ).mechanism()
+    along, label = np.linspace(60.0, 420.0, 73), "the angle of O-A from the x axis (deg)"
+    turn = udk.kinematics(mech, "motor1", np.radians(along))
+    scene, angles = driven_figure(mech, turn, along, label).axes
+    assert [scene.get_xlabel(), angles.get_ylabel()] == ["x (mm)", "angle (deg)"]
+    assert angles.get_xlabel() == label
+    crank = line(angles, "crank")
+    np.testing.assert_allclose(crank[:, 0], crank[:, 1], atol=1e-6)  # both count from the x axis
+    ticks = scene.get_xticks()
+    shown = [float(scene.xaxis.get_major_formatter()(x, k)) for k, x in enumerate(ticks)]
+    np.testing.assert_allclose(shown, 1e3 * ticks, rtol=1e-5)
+    assert all(x % 10 == 0 for x in shown)
+    assert set(np.diff(angles.get_xticks())) <= {45.0, 90.0}
+    supports = [x.get_xydata() for x in scene.lines if x.get_marker() == "^"]
+    np.testing.assert_allclose(np.concatenate(supports), [[0, 0]])  # none where the slider began
+    (alone,) = driven_figure(mech, udk.kinematics(mech, "motor1", [1.0]), along[:1], label).axes
+    assert alone.get_ylabel() == "y (mm)"
 
 
 def luminance(colour):

@@ -10,6 +10,7 @@ from udkjax.extras import OptionalImport
 
 if TYPE_CHECKING:
     from udkjax.annotations import Numbers
+    from udkjax.cli.common import Columns
     from udkjax.positions.answers.counting import Count
     from udkjax.positions.following.kinematics import Travel
 
@@ -142,8 +143,12 @@ def kinematics(
     if plot is not None:
         from udkjax.show.figures import channels_figure, driven_figure
 
-        label = f"{driver} ({motion.unit})"
-        picture = channels_figure(motion.values, columns, label, mech.name) if columns else driven_figure(mech, motion, driver)
+        label = f"{driver}: {counted.words} ({counted.unit})"
+        along = np.array([counted.shown(value) for value in np.asarray(motion.values)])
+        if columns:
+            picture = channels_figure(along, _in_units(columns, counted), label, mech.name)
+        else:
+            picture = driven_figure(mech, motion, along, label)
         picture.savefig(plot, dpi=150)
     write(out, text, variables, coordinates, {"driver": driver, "rate": speed})
     show(results, said, json)
@@ -151,6 +156,15 @@ def kinematics(
         fail(
             f"{number - reached} values cannot be reached: {names[int(np.argmin(np.asarray(motion.reached)))].replace('_', ' ')}"
         )
+
+
+def _in_units(columns: "Columns", counted: "Count") -> "Columns":
+    """Return channels in the units of the drawing."""
+    length, size = counted.units.shown("m"), counted.units.size("m")
+    shown = {"m": (length, size), "m/s": (f"{length}/s", size), "m/s2": (f"{length}/s²", size)}
+    shown["rad"] = counted.units.shown("rad"), counted.units.size("rad")
+    found = {name: (values, *shown.get(unit, (unit, 1.0))) for name, (values, unit) in columns.items()}
+    return {name: (values / size, unit) for name, (values, unit, size) in found.items()}
 
 
 def _end(travel: "Travel", side: int, counted: "Count") -> str:

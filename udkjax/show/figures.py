@@ -15,17 +15,20 @@ from udkjax.study.tolerancing import ToleranceAnalysis
 with OptionalImport():
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from matplotlib.ticker import MaxNLocator
 
 
-def driven_figure(mech: Mechanism, motion: Kinematics, driver: str) -> Figure:
-    """Draw the poses and the angles of a mechanism over the values of a driver."""
-    figure = Figure(figsize=(10, 4.6), layout="constrained")
-    scene, angles = figure.subplots(1, 2)
-    q = np.asarray(motion.q)
+def driven_figure(mech: Mechanism, motion: Kinematics, along: Float[np.ndarray, "T"], label: str) -> Figure:
+    """Draw the poses of a mechanism, and its angles along the shown values of a driver; at one value, the pose alone."""
+    q, is_alone = np.asarray(motion.q), len(along) == 1
+    figure = Figure(figsize=(6 if is_alone else 10, 4.6), layout="constrained")
+    scene, *angles = np.ravel(figure.subplots(1, 1 if is_alone else 2))
     draw_motion(scene, mech, q[np.isfinite(q).all((1, 2))])
-    draw_angles(angles, mech, motion.values, q)
-    angles.set_xlabel(f"{driver} ({motion.unit})")
-    figure.suptitle(mech.name)
+    for axes in angles:
+        draw_angles(axes, mech, along, q)
+        axes.set_xlabel(label)
+        _tick_turns(axes, label)
+    figure.suptitle(": ".join(filter(None, (mech.name, f"{label}: {along[0]:.6g}" if is_alone else ""))))
     return figure
 
 
@@ -48,8 +51,15 @@ def channels_figure(
     for axes, unit in zip(panels, kinds, strict=True):
         draw_channels(axes, x, {name: values for name, (values, of_unit) in channels.items() if of_unit == unit}, unit)
     panels[-1].set_xlabel(label)
+    _tick_turns(panels[-1], label)
     figure.suptitle(title)
     return figure
+
+
+def _tick_turns(axes: Axes, label: str) -> None:
+    """Put the ticks of an axis of degrees, as its label says, at parts of a turn."""
+    if label.endswith("(deg)"):
+        axes.xaxis.set_major_locator(MaxNLocator(9, steps=[1, 1.5, 3, 4.5, 9, 10]))
 
 
 def reactions_figure(ts: ArrayLike, loads: Mapping[str, Mapping[str, ArrayLike]], title: str = "") -> Figure:

@@ -9,7 +9,7 @@ Every axis is labelled with its unit. Colour-blind readers can distinguish the c
 dashes. Only `trajectory` creates a new figure.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,12 +19,13 @@ from udkjax.equations.rows.analysis import analyse
 from udkjax.equations.states.quantities import Energy, energy, violation
 from udkjax.extras import OptionalImport
 from udkjax.integrate import Solution
-from udkjax.scene.elements.bodies import GROUND
+from udkjax.scene.drawing import Drawing
+from udkjax.scene.drawing.drawn_quantities import Units
 from udkjax.scene.mechanism import Mechanism
 from udkjax.show import fit_figures, sweep_figures
 from udkjax.show.player.marks.mark_kinds import MarkKind
 from udkjax.show.player.marks.mark_places import body_points, to_ground
-from udkjax.show.player.marks.marks import marks
+from udkjax.show.player.marks.marks import Mark, marks
 from udkjax.show.player.player_data import trace_anchors
 from udkjax.show.style import COLOURS, DASHES, MARKERS, legend, plain
 from udkjax.study.accuracy import largest_violation
@@ -32,6 +33,7 @@ from udkjax.study.accuracy import largest_violation
 with OptionalImport():
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from matplotlib.ticker import MaxNLocator
 
 if TYPE_CHECKING:
     import xarray
@@ -75,13 +77,14 @@ def trajectory(mech: Mechanism, sol: Solution, ghosts: int = 5) -> Figure:
 
 def draw_motion(axes: Axes, mech: Mechanism, q: Float[np.ndarray, "T bodies 3"], ghosts: int = 5) -> Axes:
     """Draw the mechanism in the first of the poses `q`, more faintly in `ghosts` others, and the paths of its pins."""
-    attachments, drawn = body_points(mech), list(_outlines(mech, q))
+    attachments, drawn = body_points(mech), marks(mech, q)
+    outlines = list(_outlines(drawn))
     for index, *point in trace_anchors(mech, q, None, float(analyse(mech).length)):
         path = to_ground(point, q[:, int(index)])
         axes.plot(*path.T, color=COLOURS[int(index) % len(COLOURS)], lw=0.6, alpha=0.6, zorder=1)
     for instant in reversed(farthest_instants(q, ghosts + 1)):
         strength = 1.0 if instant == 0 else 0.22
-        for index, points, closed in drawn:
+        for index, points, closed in outlines:
             colour = COLOURS[index % len(COLOURS)]
             x, y = to_ground(np.append(points, points[:1], axis=0) if closed else points, q[instant, index, None]).T
             if closed:
@@ -92,8 +95,9 @@ def draw_motion(axes: Axes, mech: Mechanism, q: Float[np.ndarray, "T bodies 3"],
         if len(attachments[body]):
             axes.plot(*to_ground(attachments[body], q[0, index, None]).T, "o", ms=4.5, mfc="white", mec=colour, mew=1.2, zorder=4)
         axes.plot(*q[0, index, :2], "o", ms=3, color=colour, zorder=4)
-    axes.plot(*attachments[GROUND].T, "^", ms=9, color="0.45", lw=0, zorder=1.5)
-    return _plane(axes)
+    supports = [mark["at"] for mark in drawn if mark["kind"] == MarkKind.SUPPORT]
+    axes.plot(*np.reshape(supports, (-1, 2)).T, "^", ms=9, color="0.45", lw=0, zorder=1.5)
+    return _plane(axes, _units(mech))
 
 
 def draw_angles(axes: Axes, mech: Mechanism, ts: ArrayLike, q: Float[np.ndarray, "T bodies 3"]) -> Axes:
@@ -107,9 +111,11 @@ def draw_angles(axes: Axes, mech: Mechanism, ts: ArrayLike, q: Float[np.ndarray,
                 break
         else:
             groups.append((angle, [body], COLOURS[index % len(COLOURS)]))
+    units = _units(mech)
     for angle, names, colour in groups:
+        angle = angle / units.size("rad")
         axes.plot(ts, angle, color=colour, lw=1.2, label=", ".join(names) if len(names) < 5 else f"{names[0]} ... {names[-1]}")
-    axes.set(xlabel="time (s)", ylabel="angle (rad)")
+    axes.set(xlabel="time (s)", ylabel=f"angle ({units.shown('rad')})")
     if len(groups) <= len(COLOURS):
         legend(axes)
     return axes
@@ -222,9 +228,9 @@ def farthest_instants(q: Float[np.ndarray, "T bodies 3"], count: int) -> list[in
     return chosen
 
 
-def _outlines(mech: Mechanism, q: Float[np.ndarray, "T bodies 3"]) -> Iterator[tuple[int, Float[np.ndarray, "points 2"], bool]]:
+def _outlines(drawn: Sequence[Mark]) -> Iterator[tuple[int, Float[np.ndarray, "points 2"], bool]]:
     """Iterate over the lines that bodies are drawn with: index of the body, points in its frame (m), True for a closed line."""
-    for mark in marks(mech, q):
+    for mark in drawn:
         if mark["kind"] in (MarkKind.LINK, MarkKind.OUTLINE):
             yield mark["body"], np.add(mark["points"], mark.get("at", (0.0, 0.0))), mark.get("closed", True)
             yield from ((mark["body"], np.asarray(hole), True) for hole in mark.get("holes", ()))
@@ -232,7 +238,27 @@ def _outlines(mech: Mechanism, q: Float[np.ndarray, "T bodies 3"]) -> Iterator[t
             yield mark["body"], np.add(mark["at"], mark["radius"] * _CIRCLE), True
 
 
-def _plane(axes: Axes) -> Axes:
-    axes.set(xlabel="x (m)", ylabel="y (m)", aspect="equal")
-    axes.locator_params(nbins=MOST_TICKS)
+def _units(mech: Mechanism) -> Units:
+    """Return the units of a drawing; SI units without one."""
+    return Units(dict(mech.drawing.units) if isinstance(mech.drawing, Drawing) else None)
+
+
+def _plane(axes: Axes, units: Units | None = None) -> Axes:
+    """Label the axes of a plane in m, or with the unit of lengths of a drawing."""
+    unit, size = ("m", 1.0) if units is None else (units.shown("m"), units.size("m"))
+    axes.set(xlabel=f"x ({unit})", ylabel=f"y ({unit})", aspect="equal")
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_locator(_TicksInUnit(size))
+        axis.set_major_formatter(lambda x, _: f"{x / size:.6g}")
     return plain(axes)
+
+
+class _TicksInUnit(MaxNLocator):
+    """Ticks at round numbers of a unit, along an axis in m."""
+
+    def __init__(self, size: float):
+        self.size = size
+        super().__init__(MOST_TICKS, steps=[1, 2, 2.5, 5, 10])
+
+    def tick_values(self, vmin: float, vmax: float) -> np.ndarray:
+        return self.size * np.asarray(super().tick_values(vmin / self.size, vmax / self.size))

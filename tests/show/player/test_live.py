@@ -68,6 +68,22 @@ def test_a_slider_has_a_label_and_a_section(name, label, section):
     assert (label_of(name), section_of(name)) == (label, section)
 
 
+def test_sliders_of_lengths_have_the_names_of_links():
+    pins = {"O": (0, 0), "C": (1, 0), "A": udk.polar("O", 0.4, 1.0), "B": udk.circles(("A", "C"), (1.2, 0.8), "left")}
+    pins["P"] = udk.polar("A", 0.5, 0.3, line=("A", "B"))
+    links = {name: {"pins": list(ends), "mass": 1} for name, ends in {"crank": "OA", "coupler": "ABP", "rocker": "CB"}.items()}
+    sliders = sliders_of(udk.Drawing(pins, links, ["O", "C"], motors=[{"pin": "O", "speed": 1.0}]).mechanism(), True)
+    found = {one.name: one.label for one in sliders if one.section == "Lengths and angles"}
+    assert found == {
+        "pin.A.length": "crank",
+        "pin.A.angle": "crank angle",
+        "pin.B.length[0]": "coupler A-B",
+        "pin.B.length[1]": "rocker",
+        "pin.P.length": "coupler A-P",
+        "pin.P.angle": "coupler A-P angle",
+    }
+
+
 @pytest.mark.parametrize("mechanism", [udk.library.four_bar(), COUPLER_POINT.mechanism()], ids=["four-bar", "coupler point"])
 def test_symbols_are_updated_with_the_numbers_that_they_are_made_of(mechanism):
     """With other numbers every updated place is that of the symbols of the changed mechanism."""

@@ -234,7 +234,7 @@ def test_every_kind_of_mark_is_drawn(tmp_path):
     )
     (contact,) = udk.Contact("free").expand(mech)
     assert isinstance(contact.condition, Gap)
-    every = marks(mech, mech.q0[None], gaps=[contact.condition], targets=[(1.0, 2.0)])
+    every = marks(mech, mech.q0[None], gaps=[contact.condition], targets=[(1.0, 2.0)], traced=[[5, 0.05, -0.3]])
     found = {mark["kind"] for mark in every}
     assert found == SYMBOLS.keys()
     view = view_of((-1, -1, 4, 2), 600)

@@ -325,3 +325,18 @@ def test_the_page_knows_the_ways_in_which_a_run_ends():
     source = (files("udkjax") / "show" / "player" / "engine.js").read_text()
     found = re.search(r"const STATUSES = (\[.*?\]);", source)
     assert found and json.loads(found[1]) == [name.lower() for name in vars(Status) if name.isupper()]
+
+
+def test_a_slot_is_drawn_on_its_lever_and_a_traced_end_has_a_dot():
+    pins = {"A": (0, 0), "B": udk.polar("A", 50, 60), "E": (0, -30), "D": udk.polar("E", 110, 0, line=("E", "B"))}
+    links = {"crank": {"pins": ["A", "B"], "mass": 1}, "lever": {"pins": ["E", "D"], "mass": 1}}
+    slots, motors = [{"pin": "B", "along": ["E", "D"], "on": "lever"}], [{"pin": "A", "speed": "60 rpm"}]
+    mech = udk.Drawing(pins, links, ["A", "E"], motors=motors, slots=slots, units={"length": "mm"}).mechanism()
+    run = udk.animate(mech, udk.simulate(mech, np.linspace(0.0, 1.0, 51)), measures=()).data["runs"][0]
+    kinds = [(mark["kind"], mark.get("body")) for mark in run["marks"]]
+    lever = list(mech.bodies).index("lever")
+    assert kinds.index(("rail", lever)) > kinds.index(("link", lever))
+    (dot,) = (mark for mark in run["marks"] if mark["kind"] == "traced")
+    assert dot["body"] == lever and [lever, *dot["at"]] in run["traces"]
+    ends = next(mark["points"] for mark in run["marks"] if mark["kind"] == "link" and mark["body"] == lever)
+    assert min(np.linalg.norm(np.subtract(dot["at"], end)) for end in ends) < 1e-9

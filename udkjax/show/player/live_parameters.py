@@ -26,12 +26,13 @@ SECTIONS = {
     "friction": "Friction",
     "spring": "Springs",
     "damper": "Dampers",
+    "length": "Lengths and angles",
     "pin": "Pins",
     "joint": "Joints",
     "body": "Bodies",
     "link": "Links",
 }  # sections in order; further ones follow
-PLACES = ("points", "point", "position", "velocity", "vector", "gravity")  # fields whose two entries are x and y
+PLACES = ("points", "point", "position", "velocity", "vector", "gravity", "force")  # fields whose two entries are x and y
 NOT_NEGATIVE = ("kg", "kg m2", "kg/m3", "N/m", "N s/m", "N m/rad", "N m s/rad")  # units of quantities that are never negative
 INITIAL = "Initial state"
 # Initial values; position and angle of bodies, from which assembly starts, are added to these.
@@ -74,7 +75,7 @@ def sliders_of(mechanism: Mechanism, live: Live) -> list[Slider]:
     ranges = live if isinstance(live, Mapping) else {}
     scales = analyse(mechanism).scales
     length, rate = float(scales.length), float(scales.rate) or 1.0
-    sliders, bound = [], pins_in_line(mechanism)
+    sliders, bound, links = [], pins_in_line(mechanism), dimensions_of_links(mechanism)
     written = Units(dict(mechanism.drawing.units) if isinstance(mechanism.drawing, Drawing) else None)
     for name, value in scalar_parameters(mechanism, wanted).items():
         if wanted is None and (".profile." in name or _base(name) in bound):  # the drawn outline of a cam does not change
@@ -86,8 +87,32 @@ def sliders_of(mechanism: Mechanism, live: Live) -> list[Slider]:
             raise ValueError(f"live: the range {low:g} to {high:g} of {name} does not contain its value {value:g}")
         shown = written.shown(unit)
         per_unit = 1.0 / conversion_factor(shown, unit) if shown != unit else 1.0
-        sliders.append(Slider(name, label_of(name), section_of(name), unit, value, float(low), float(high), shown, per_unit))
+        label, section = links.get(name) or label_of(name), SECTIONS["length"] if name in links else section_of(name)
+        sliders.append(Slider(name, label, section, unit, value, float(low), float(high), shown, per_unit))
     return in_sections(sliders)
+
+
+def dimensions_of_links(mechanism: Mechanism) -> dict[str, str]:
+    """Return labels of the lengths and angles by which pins are given from others, by parameter: with the link of both pins."""
+    drawing, found = mechanism.drawing, {}
+    if not isinstance(drawing, Drawing):
+        return found
+
+    def of_link(start: str, end: str) -> str:
+        for name, link in drawing.links.items():
+            if {start, end} <= {*link.pins}:
+                return name if len(link.pins) == 2 else f"{name} {start}-{end}"
+        return f"{start}-{end}"
+
+    for pin, form in drawing.groups["pin"].items():
+        starts = getattr(form, "from_", None)
+        if starts is None or getattr(form, "length", None) is None or hasattr(form, "to"):
+            continue
+        if isinstance(starts, str):
+            found |= {f"pin.{pin}.length": of_link(starts, pin), f"pin.{pin}.angle": f"{of_link(starts, pin)} angle"}
+        else:
+            found |= {f"pin.{pin}.length[{k}]": of_link(start, pin) for k, start in enumerate(starts)}
+    return found
 
 
 def pins_in_line(mechanism: Mechanism) -> set[str]:

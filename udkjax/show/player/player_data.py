@@ -82,12 +82,13 @@ def run_record(
     steps = np.tile([PRECISION * length, PRECISION * length, PRECISION], q.shape[1])
     frame = float(np.median(np.diff(ts[shown]))) if len(shown) > 1 else 1.0
     poses = q[shown]
+    traced = trace_anchors(mechanism, poses, traces, length)
     record = {
         "label": label,
         "note": failure_of(solution) or (getattr(solution, "cause", "") if count < len(ts) else ""),
         "bodies": list(mechanism.bodies),
-        "marks": marks(mechanism, poses, shapes, gaps, targets),
-        "traces": trace_anchors(mechanism, poses, traces, length),
+        "marks": marks(mechanism, poses, shapes, gaps, targets, traced),
+        "traces": traced,
         "time": pack(ts[shown, None], TIME_PRECISION * max(np.ptp(ts), frame)),
         "q": pack(poses.reshape(len(shown), -1), steps),
         "v": pack(frame * v[shown].reshape(len(shown), -1), steps),

@@ -18,6 +18,7 @@ class MarkKind(StrEnum):
     PIN = "pin"  # body, at, name: a revolute joint or the end of a rod
     ROLLER = "roller"  # body, at: slides in a slot or follows a cam
     TARGET = "target"  # body, at: a wanted place
+    TRACED = "traced"  # body, at: a point whose path is drawn, and that no other mark shows
     WELD = "weld"  # body, at: a joint without relative motion
     ROD = "rod"  # a, b: a distance joint between two anchors
     SPRING = "spring"  # a, b, damper, length: a spring between two anchors, and its typical length (m)

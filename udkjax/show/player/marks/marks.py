@@ -30,6 +30,7 @@ Poses = Float[np.ndarray, "T bodies 3"]
 PROFILE_POINTS = 180  # number of points of a cam's outline
 TOUCHING = 0.02  # relative to their distance: wheels with a larger gap are joined by a belt
 ROD = 0.01  # relative difference from the inertia of a uniform rod up to which a body is drawn as a rod
+SAME_MARK = 1e-6  # relative to the size: a traced point closer to a mark is shown by it
 MARGIN = 0.08  # length of a rail beyond the used range, relative to the mechanism's length
 
 
@@ -39,6 +40,7 @@ def marks(
     shapes: BodyPoints | None = None,
     gaps: Sequence[Gap] = (),
     targets: Numbers | None = None,
+    traced: Sequence[Sequence[float]] = (),
 ) -> list[Mark]:
     """Return the marks of a mechanism, from back to front.
 
@@ -48,6 +50,7 @@ def marks(
         shapes: further points (n, 2) of bodies by name, in the bodies' frames (m), that the drawn bodies pass through.
         gaps: conditions of contacts, whose lines are drawn.
         targets: wanted places (n, 2) on the ground (m).
+        traced: anchors, [index of a body, x, y], whose paths are drawn; they get a mark where no other one is.
 
     Raises:
         ValueError: a name in `shapes` is not a body.
@@ -63,9 +66,12 @@ def marks(
     links = drawing.links()
     plates = [mark for mark in links if mark.get("closed")]
     bars = [mark for mark in links if not mark.get("closed")]
+    in_links = [mark for mark in drawing.rails if mark.get("slot") and mark["body"] >= 0]  # they cover their links
+    rails = [mark for mark in drawing.rails if mark not in in_links]
     rings = [mark for mark in drawing.wheels if mark.get("internal")]
     wheels = [mark for mark in drawing.wheels if not mark.get("internal")]
-    return [*rings, *drawing.rails, *plates, *wheels, *bars, *drawing.elements, *drawing.pins, *wanted]
+    found = [*rings, *rails, *plates, *wheels, *bars, *in_links, *drawing.elements, *drawing.pins, *wanted]
+    return [*found, *drawing.unmarked(traced, found)]
 
 
 class _Drawing:
@@ -119,6 +125,17 @@ class _Drawing:
                 radius = min(np.sqrt(inertia / mass), self.size / 4)
                 found.append({"kind": MarkKind.DISC, "body": k, "at": [0.0, 0.0], "radius": radius})
         return found
+
+    def unmarked(self, traced: Sequence[Sequence[float]], drawn: Sequence[Mark]) -> list[Mark]:
+        """Return marks of the traced points at which no mark is in the first pose."""
+
+        def place(body: float, at: Numbers) -> np.ndarray:
+            return self._path(self._names[int(body)], at)[0]
+
+        places = [place(mark["body"], mark["at"]) for mark in drawn if "at" in mark]
+        near = SAME_MARK * self.size
+        free = [one for one in traced if all(np.linalg.norm(place(one[0], one[1:]) - x) > near for x in places)]
+        return [{"kind": MarkKind.TRACED, "body": int(body), "at": [x, y]} for body, x, y in free]
 
     def _joint(self, name: str, joint: Joint) -> None:
         match joint:

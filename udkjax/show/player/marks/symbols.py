@@ -154,6 +154,10 @@ def _pin(mark: Mark, unit: float) -> Iterator[Symbol]:
     yield _circle(_at(mark), (0, 4.2), "back", "ink", 1.7)
 
 
+def _traced(mark: Mark, unit: float) -> Iterator[Symbol]:
+    yield _circle(_at(mark), (0, 3), _edge(mark["body"]), "back", 1)
+
+
 def _roller(mark: Mark, unit: float) -> Iterator[Symbol]:
     yield _circle(_at(mark), (0, 4.8), _tint(mark["body"]), "ink", 1.7)
     yield _circle(_at(mark), (0, 1.2), "ink")
@@ -255,6 +259,7 @@ SYMBOLS = {
     MarkKind.SUPPORT: _support,
     MarkKind.PIN: _pin,
     MarkKind.ROLLER: _roller,
+    MarkKind.TRACED: _traced,
     MarkKind.WELD: _weld,
     MarkKind.TARGET: _target,
     MarkKind.ROD: _rod,
