@@ -43,10 +43,9 @@ MANY = {"chains": 32, "draws": 50, "warmup": 100}  # for scenes in events
 FEW = {"chains": 8, "draws": 250}
 SETS = {"chains": 4, "draws": 100, "warmup": 100}  # of a calibration set
 LEVELS = 0.5, 0.95
-WRONG = (
-    0.35,
-    1.35,
-)  # errors of trusted means, in deviations, and of deviations, as a factor
+# Errors of trusted means, in deviations, and of deviations, as a factor, that are wrong: the largest that are trusted, 0.25 and
+# 1.25, and 1.5 standard errors of the means and deviations of a set's draws, some 200 effective ones.
+WRONG = 0.35, 1.35
 SWING, SWING_NOISE = np.linspace(0.0, 5.0, 60), 0.02
 LONG = np.linspace(0.0, 20.0, 200)  # linear and exponential decay hardly differ in shorter records
 LAWS = {

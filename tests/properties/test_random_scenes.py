@@ -105,6 +105,14 @@ def test_loads_that_rounds_do_not_settle_are_followed_from_those_without_frictio
     assert error < 1e-6 * np.max(abs(right) / unit)
 
 
+def test_rounds_for_loads_end_where_the_load_of_a_slide_is_nearly_zero():
+    """A correction that leads back to the sign of the load before is not kept, or the rounds would not end."""
+    scene = with_friction(random_scene(0, 161, 5))
+    start, ts, mechanism = udk.State(*state_of(scene.table)), [0.0, 0.05 * scene.time], build(scene.table)
+    ends = [udk.simulate(mechanism, ts, start, rtol=tol, atol=tol).q[-1] for tol in (1e-8, 1e-11)]
+    np.testing.assert_allclose(ends[0], ends[1], rtol=1e-7)
+
+
 @pytest.mark.slow
 def test_forces_are_watched_where_loads_are_followed_from_those_without_friction():
     """A block beside such a mechanism sticks in machine code, which does not leave the run to its plain form."""

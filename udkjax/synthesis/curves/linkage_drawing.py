@@ -15,9 +15,9 @@ from udkjax.synthesis.curves.dyads import BASE, EACH, GEARED, HEAD, SECOND, TAIL
 from udkjax.synthesis.curves.targets import WantedCurve
 
 PIN = "P"  # name of the drawing pin
-TURN_VALUES = 720  # positions of a turn at which the constraints must hold, on one branch
+CHECKED_POSITIONS = 720  # positions of a turn at which the constraints must hold, on one branch
 CLOSED_TO = 1e-12  # largest residual of a constraint at these positions, relative to coordinates of its pins, or to a turn
-SAME_PLACE = 1e-8  # largest distance of a pin from itself by another method, relative to these; on other branches it is elsewhere
+SAME_BRANCH = 1e-8  # largest distance of a pin from itself by another method, relative to these; beyond, it is another branch
 DENSITY = 7850.0  # kg/m^3, of steel
 WIDTH, THICKNESS = 0.03, 0.01  # of links, relative to the extent of the curve
 WHEELS = 0.6  # sum of the radii of two wheels, relative to the distance of their centres
@@ -100,7 +100,7 @@ def turns_on_its_branch(mechanism: Mechanism, x: np.ndarray, topology: Topology,
         wanted: the curve.
         size: coordinates of pins (m) are no larger.
     """
-    turns = np.linspace(0.0, 1.0, TURN_VALUES + 1)
+    turns = np.linspace(0.0, 1.0, CHECKED_POSITIONS + 1)
     motion = kinematics(mechanism, None, turns / TURNS_PER_SECOND)
     if not np.all(motion.reached):
         return False
@@ -109,4 +109,4 @@ def turns_on_its_branch(mechanism: Mechanism, x: np.ndarray, topology: Topology,
     pin = wanted.middle + wanted.scale * positions(x[None], topology, FULL_TURN * turns[None], 0.0).pin[0]
     off = np.abs(np.asarray(motion.path(*locate(mechanism, f"pin.{PIN}", None))) @ [1, 1j] - pin)
     is_closed = open_by[:, :-of_motor].max() <= CLOSED_TO * size and open_by[:, -of_motor:].max() <= CLOSED_TO * FULL_TURN
-    return bool(is_closed and off.max() <= SAME_PLACE * size)
+    return bool(is_closed and off.max() <= SAME_BRANCH * size)

@@ -23,13 +23,13 @@ from udkjax.synthesis.curves.dyads import (
 from udkjax.synthesis.curves.targets import CurveTarget
 
 RATIOS = (1, -1, 2, -2, 3, -3, 4, -4, 5, -5)  # turns of a second crank for one of the crank
-TURN_VALUES = 72  # angles of the crank over a turn
+MATCHED_ANGLES = 72  # angles of the crank over a turn
 Linkages = tuple[np.ndarray, Topology]
 
 
 def turn_angles(K: int) -> np.ndarray:
     """Return the angles (K, 72) of a turn."""
-    return np.broadcast_to(np.arange(TURN_VALUES) * (FULL_TURN / TURN_VALUES), (K, TURN_VALUES))
+    return np.broadcast_to(np.arange(MATCHED_ANGLES) * (FULL_TURN / MATCHED_ANGLES), (K, MATCHED_ANGLES))
 
 
 def random_linkages(K: int, dyads: int, rng: np.random.Generator, geared: bool = False) -> Linkages:
