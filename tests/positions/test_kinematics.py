@@ -515,6 +515,13 @@ def test_what_cannot_be_driven_is_refused():
         udk.kinematics(udk.library.double_pendulum(), f"body.{udk.library.double_pendulum().body_names[0]}.angle", [1.0])
 
 
+def test_the_value_of_a_coordinate_takes_frames():
+    crank = udk.Coordinate(["ground", "crank"], "angle")
+    for given, said in ((np.zeros(3), np.zeros(3)), "ndarray, ndarray"), ((), "nothing"):
+        with pytest.raises(TypeError, match=f'a udk.Frame of each of "ground", "crank", not {said}'):
+            crank.value(*given)
+
+
 ASK = {
     "kinematics": lambda mech, driver: udk.kinematics(mech, driver, [1.0]),
     "travel": udk.travel,

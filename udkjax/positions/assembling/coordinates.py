@@ -64,7 +64,13 @@ class Coordinate(PrintsLine):
         return Driver(self.bodies, self.coordinate, constant_motion(0.0) if motion is None else motion, self.points, self.axis)
 
     def value(self, *frames: Frame) -> Float[Array, ""]:
-        """Return the value (rad, m) of the coordinate, from the frames of its bodies."""
+        """Return the value (rad, m) of the coordinate, from the frames of its bodies.
+
+        Raises an `ArgumentTypeError` unless two `Frame` objects are given.
+        """
+        if len(frames) != len(self.bodies) or not all(isinstance(x, Frame) for x in frames):
+            given = ", ".join(type(x).__name__ for x in frames) or "nothing"
+            raise ArgumentTypeError(f"value takes a udk.Frame of each of {', '.join(map(quote, self.bodies))}, not {given}")
         driver = self.driver().complete()
         if is_traced((driver, frames)):
             return jnp.asarray(driver.residual(0.0, *frames)[0])
