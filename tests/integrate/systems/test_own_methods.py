@@ -57,6 +57,37 @@ def test_a_pseudoinverse_in_machine_code():
     assert_allclose(found[3], angles(masses[3], BenIsrael(), engine="native"), atol=1e-8)
 
 
+class Decomposed(udk.MatrixPseudoinverse):
+    """D^+ by a decomposition of LAPACK, as it is written first."""
+
+    by: str = eqx.field(static=True, default="pinv")
+
+    def matrix(self, D):
+        if self.by == "pinv":
+            return jnp.linalg.pinv(D)
+        if self.by == "lstsq":
+            return jnp.linalg.lstsq(D, jnp.eye(len(D)))[0]
+        if self.by == "eigh":
+            values, vectors = jnp.linalg.eigh(D @ D.T)
+            is_large = values > 1e-12 * values[-1]
+            return D.T @ (vectors * jnp.where(is_large, 1 / jnp.where(is_large, values, 1.0), 0.0)) @ vectors.T
+        Q, R, p = jax.scipy.linalg.qr(D, mode="economic", pivoting=True)
+        diagonal = jnp.abs(jnp.diagonal(R))
+        used = diagonal > 1e-10 * diagonal[0]
+        Z, L = jnp.linalg.qr(jnp.where(used[:, None], R, 0.0).T)
+        inverse = jnp.where(used[:, None] & used, jnp.linalg.inv(L.T + jnp.diag(jnp.where(used, 0.0, 1.0))), 0.0)
+        return jnp.zeros_like(D.T).at[p].set(Z @ inverse @ Q.T)
+
+
+@pytest.mark.parametrize("by", ["pinv", "lstsq", "eigh", "qr"])
+def test_decompositions_of_lapack_in_machine_code(by):
+    """Redundant rows, in lanes and alone: the memory of both is that of one text."""
+    masses = jnp.array([1.0, 1.5, 2.0])
+    found = jax.jit(jax.vmap(lambda mass: angles(mass, Decomposed(by=by), engine="native")))(masses)
+    assert_allclose(found[1], angles(masses[1], udk.Greville()), atol=1e-8)
+    assert_allclose(found[1], angles(masses[1], Decomposed(by=by), engine="native"), atol=1e-8)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("derivative", [jax.jacfwd, jax.jacrev, lambda of: jax.jacfwd(jax.jacfwd(of))])
 def test_derivatives_of_a_pseudoinverse_in_machine_code(derivative):
@@ -143,11 +174,11 @@ def test_derivatives_of_a_formulation_in_machine_code(derivative):
     assert_allclose(own, other, rtol=1e-9, atol=1e-9)
 
 
-class ByEigenvalues(udk.PointwiseFormulation):
+class BySchurVectors(udk.PointwiseFormulation):
     power: Any = None
 
     def solve(self, M, F, A, c):
-        return jnp.linalg.eigh(M)[1] @ F
+        return jax.scipy.linalg.schur(M)[1] @ F
 
 
 class OfWrongShape(udk.PointwiseFormulation):
@@ -158,8 +189,8 @@ class OfWrongShape(udk.PointwiseFormulation):
 @pytest.mark.parametrize(
     ("formulation", "reason"),
     [
-        (ByEigenvalues(), "the operation eigh of the formulation ByEigenvalues"),
-        (ByEigenvalues(np.arange(2)), "arrays of type int64 of the formulation ByEigenvalues"),
+        (BySchurVectors(), "the operation schur of the formulation BySchurVectors"),
+        (BySchurVectors(np.arange(2)), "arrays of type int64 of the formulation BySchurVectors"),
         (OfWrongShape(), "the formulation OfWrongShape"),
     ],
 )
@@ -177,9 +208,10 @@ def test_a_formulation_of_a_system_whose_masses_couple():
     assert_allclose(runs[0].q, runs[1].q, atol=1e-6)
 
 
-class OfSingularValues(udk.MatrixPseudoinverse):
+class OfSchurForm(udk.MatrixPseudoinverse):
     def matrix(self, D):
-        return jnp.linalg.pinv(D)
+        T, Z = jax.scipy.linalg.schur(D @ D.T)
+        return D.T @ Z @ jnp.linalg.pinv(jnp.diag(jnp.diagonal(T))) @ Z.T
 
 
 class WithArray(BenIsrael):
@@ -194,7 +226,7 @@ class OfOneShape(udk.MatrixPseudoinverse):
 @pytest.mark.parametrize(
     ("method", "reason"),
     [
-        (OfSingularValues(), "the operation svd of the pseudoinverse OfSingularValues"),
+        (OfSchurForm(), "the operation schur of the pseudoinverse OfSchurForm"),
         (WithArray(scale=jnp.array(2.0)), "arrays other than rank_tol of the pseudoinverse WithArray"),
         (OfOneShape(), "OfOneShape"),
     ],

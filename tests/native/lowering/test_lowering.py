@@ -17,7 +17,8 @@ from udkjax.native.code import machine, processor
 from udkjax.native.language.program import UnsupportedError
 from udkjax.native.language.text import text_of_module
 from udkjax.native.lowering.arrays import Stored, base_of
-from udkjax.native.lowering.lowering import LoweredFunction, Lowering
+from udkjax.native.lowering.lowering import LoweredFunction, Lowering, traced
+from udkjax.native.lowering.own_objects import Written
 from udkjax.native.lowering.rules import CONTROL, ELEMENTWISE, RULES, lower
 from udkjax.native.lowering.varying import inlined
 
@@ -110,6 +111,42 @@ def definite(a, b):
     return jnp.linalg.cholesky(square), jnp.linalg.cholesky(a[:, :4] + a[:, :4].T), cho_solve(cho_factor(square), b)
 
 
+def reflections(a):
+    """Signs are those of LAPACK; of a deficient matrix, products are compared."""
+    modes, deficient = ("reduced", "complete"), a[:, :4].at[1].set(a[0, :4])
+    known = [x for each in (a, a.T, a[:, :4], 0 * a) for mode in modes for x in jnp.linalg.qr(each, mode=mode)]
+    pivoted = [x for each in (a, a.T) for x in jax.scipy.linalg.qr(each, pivoting=True)]
+    q, r = jnp.linalg.qr(deficient)
+    return (*known, *pivoted, q @ r, q.T @ q)
+
+
+def singular(a):
+    """Singular values, and products that the signs of singular vectors do not change."""
+    found = []
+    for x in (a, 1e-200 * a.T.at[:, 3].set(a[0])):
+        found += [jnp.linalg.svd(x, compute_uv=False) / jnp.abs(x).max(), jnp.linalg.pinv(x) * jnp.abs(x).max()]
+        for full in (True, False):
+            u, s, vt = jnp.linalg.svd(x, full_matrices=full)
+            found += [u[:, :4] * s @ vt[:4] / jnp.abs(x).max(), u.T @ u, vt @ vt.T]
+    return (*found, jnp.linalg.matrix_rank(a.at[1].set(a[0])), jnp.linalg.lstsq(a, a[:, 0])[0], jnp.linalg.norm(a, 2))
+
+
+def symmetric_ones(a):
+    found = []
+    for x in (a @ a.T, a[:, :4] + a[:, :4].T, jnp.diag(a[0]), jnp.zeros((3, 3)) + a[0, 0], 1e100 * (a.T @ a)):
+        values, vectors = jnp.linalg.eigh(x)
+        found += [values / jnp.abs(x).max(), vectors * values @ vectors.T / jnp.abs(x).max(), vectors.T @ vectors]
+    return (*found, lax.linalg.eigh(a[:, :4], lower=True, symmetrize_input=False)[1])
+
+
+def in_order(a, b):
+    holes = jnp.round(jnp.where(a > 1, jnp.nan, jnp.where(a < -1, jnp.inf, a)), 1)
+    return (
+        jnp.sort(holes), jnp.sort(holes, 0), jnp.argsort(holes, 1), jnp.sort((4 * b).astype(int)), jnp.median(a, 1),
+        *lax.sort((jnp.round(a), b), dimension=0, num_keys=2),
+    )  # fmt: skip
+
+
 CASES = {
     "arithmetic": (
         lambda a, b: (a + b, a - b, a * b, a / b, -a, jnp.abs(a), a**3, a**2, jnp.square(a), a % b, lax.sign(a)),
@@ -194,6 +231,11 @@ CASES = {
     "one branch of three": (lambda a, i: lax.switch(i, [lambda: a, lambda: 2 * a, lambda: a[::-1]]), (A, INDEX)),
     "shared branch": (lambda a: lax.fori_loop(0, 4, lambda k, x: lax.cond(k % 2 == 0, lambda: x + k, lambda: -x), a), (A,)),
     "elimination": (gauss, (A,)),
+    "reflections": (reflections, (A,)),
+    "singular values": (singular, (A,)),
+    "eigenvalues": (symmetric_ones, (A,)),
+    "in order": (in_order, (A, B)),
+    "tiled": (lambda a: (jnp.tile(a, (2, 1)), jnp.tile(a, (1, 3))), (A,)),
 }
 
 
@@ -231,8 +273,9 @@ def test_each_rule_has_a_case():
 @pytest.mark.parametrize(
     ("function", "name"),
     [
-        (lambda a: jnp.linalg.eigh(a)[0], "eigh"),
-        (jnp.sort, "sort"),
+        (jax.scipy.linalg.schur, "schur"),
+        (lambda a: jnp.linalg.svd(jnp.stack([a, a])), "svd of batches"),
+        (lambda a: lax.top_k(a, 2), "top_k"),
         (lambda a: a.astype(np.float32), "float32"),
         (lambda a: a * 1j, "complex128"),
     ],
@@ -240,6 +283,23 @@ def test_each_rule_has_a_case():
 def test_what_is_missing_is_named(function, name):
     with pytest.raises(UnsupportedError, match=name):
         write(function, (A[:, :, :4],), 1)
+
+
+def test_traces_within_others_are_equal():
+    """Otherwise a text that is stored within a trace would take other memory than one from outside."""
+    given, function = [jax.ShapeDtypeStruct((4, 5), float)], jnp.linalg.pinv
+    found = [str(traced(function, given))]
+    jax.jit(lambda x: found.append(str(traced(function, given))) or x)(0.0)
+    with jax.ensure_compile_time_eval():
+        found.append(str(traced(function, given)))
+    assert found[0] == found[1] == found[2]
+
+
+def test_memory_that_is_too_small_is_refused():
+    f, _, size = write(gauss, (A,), 1)
+    assert Written(f, size).within(size) is f
+    with pytest.raises(RuntimeError, match=f"takes memory for {size} numbers, not {size - 1}"):
+        Written(f, size).within(size - 1)
 
 
 def test_webassembly():

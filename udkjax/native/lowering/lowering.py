@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import jax
 import numpy as np
 from jax.extend import core
 
@@ -20,6 +21,12 @@ LONGEST = 40  # an array whose elements take more operations is stored, so that 
 
 
 EquationRule = Callable[["Lowering", Any, list[Array]], list[Array]]
+
+
+def traced(function: Callable[..., Any], given: Sequence[jax.ShapeDtypeStruct]) -> Any:
+    """Return the jaxpr of a function, which is the same within other traces of JAX and outside: constants are folded."""
+    with jax.ensure_compile_time_eval():
+        return jax.make_jaxpr(function)(*given)
 
 
 class LoweredFunction(Function):

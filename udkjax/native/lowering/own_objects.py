@@ -15,7 +15,7 @@ from udkjax.native.code import code_cache
 from udkjax.native.language.ir import DOUBLE
 from udkjax.native.language.program import UnsupportedError
 from udkjax.native.lowering.arrays import Stored
-from udkjax.native.lowering.lowering import LoweredFunction, Lowering
+from udkjax.native.lowering.lowering import LoweredFunction, Lowering, traced
 from udkjax.native.lowering.rules import lower
 from udkjax.native.lowering.source_key import source_key
 
@@ -115,6 +115,16 @@ class Written(NamedTuple):
     function: LoweredFunction
     size: int
 
+    def within(self, size: int) -> LoweredFunction:
+        """Return the function, for memory of `size` numbers in each lane.
+
+        Raises:
+            RuntimeError: the memory is too small.
+        """
+        if self.size > size:
+            raise RuntimeError(f"{self.function.name} takes memory for {self.size} numbers, not {size}")
+        return self.function
+
 
 @lru_cache(maxsize=64)
 def written(code: OwnMethod, inputs: tuple[Input, ...], width: int) -> Written:
@@ -138,7 +148,7 @@ def written(code: OwnMethod, inputs: tuple[Input, ...], width: int) -> Written:
 
 @lru_cache(maxsize=64)
 def _traced(code: OwnMethod, shapes: tuple[tuple[int, ...], ...]) -> Any:
-    return jax.make_jaxpr(code.evaluate)(*(jax.ShapeDtypeStruct(shape, float) for shape in shapes))
+    return traced(code.evaluate, [jax.ShapeDtypeStruct(shape, float) for shape in shapes])
 
 
 def _write(f: LoweredFunction, closed: Any, inputs: Sequence[Input]) -> int:

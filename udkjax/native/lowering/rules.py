@@ -4,10 +4,20 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
+import jax
+
 from udkjax.native.language.ir import BOOL, DOUBLE, INT, Value
 from udkjax.native.language.program import UnsupportedError, apply, sincos
 from udkjax.native.lowering.arrays import Array, Index, Lazy, base_of, fit
-from udkjax.native.lowering.lowering import Lowering
+from udkjax.native.lowering.decompositions import (
+    householder_qr,
+    jacobi_eigh,
+    jacobi_svd,
+    sorted_along,
+    symmetric,
+    tiled,
+)
+from udkjax.native.lowering.lowering import Lowering, traced
 from udkjax.native.lowering.reductions import argument, cumulative, dot, extreme, reduce_axes
 from udkjax.native.lowering.solving import cholesky, linear_solve, lu, triangular_solve
 from udkjax.native.lowering.updates import dynamic_update_slice, scatter
@@ -127,6 +137,54 @@ def _cond(to: Lowering, equation: Any, inputs: list[Array]) -> list[Array]:
     return to.cond(inputs[0], equation.params["branches"], inputs[1:])
 
 
+# --- operations that are lowered as a function in plain JAX
+
+
+def _plain(function: Callable[..., Any], p: dict[str, Any], to: Lowering, equation: Any, inputs: list[Array]) -> list[Array]:
+    avals = [v.aval for v in equation.invars]
+    closed = traced(partial(function, **p), [jax.ShapeDtypeStruct(a.shape, a.dtype) for a in avals])
+    return to.closed(closed, [to.stored(x) for x in inputs])
+
+
+def _matrix(equation: Any, **refused: Any):
+    """Raise an error for batches of matrices, and for options that no rule has."""
+    name, p = equation.primitive.name, equation.params
+    if len(equation.invars[0].aval.shape) != 2:
+        raise UnsupportedError(f"the operation {name} of batches")
+    for option, value in refused.items():
+        if p.get(option, value) != value:
+            raise UnsupportedError(f"the operation {name} with {option}={p[option]}")
+
+
+def _qr(to: Lowering, equation: Any, inputs: list[Array]) -> list[Array]:
+    p = equation.params
+    _matrix(equation)
+    found = _plain(householder_qr, {"is_full": p["full_matrices"], "pivots": p["pivoting"]}, to, equation, inputs)
+    return found if p["pivoting"] else found[:2]
+
+
+def _svd(to: Lowering, equation: Any, inputs: list[Array]) -> list[Array]:
+    _matrix(equation, subset_by_index=None)
+    found = _plain(jacobi_svd, {"is_full": equation.params["full_matrices"]}, to, equation, inputs)
+    return found if equation.params["compute_uv"] else found[:1]
+
+
+def _eigh(to: Lowering, equation: Any, inputs: list[Array]) -> list[Array]:
+    _matrix(equation, subset_by_index=None)
+    is_lower = equation.params["lower"]
+    return _plain(lambda a: jacobi_eigh(symmetric(a, is_lower)), {}, to, equation, inputs)
+
+
+def _sort(to: Lowering, equation: Any, inputs: list[Array]) -> list[Array]:
+    p = equation.params
+    given = {"axis": p["dimension"], "keys": p["num_keys"]}
+    return _plain(lambda *x, **options: sorted_along(x, **options), given, to, equation, inputs)
+
+
+def _tile(to: Lowering, equation: Any, inputs: list[Array]) -> list[Array]:
+    return _plain(tiled, {"counts": equation.params["reps"]}, to, equation, inputs)
+
+
 CONTROL = {
     "scan": _scan,
     "while": _while,
@@ -137,4 +195,9 @@ CONTROL = {
     "cholesky": cholesky,
     "triangular_solve": triangular_solve,
     "custom_linear_solve": linear_solve,
+    "qr": _qr,
+    "svd": _svd,
+    "eigh": _eigh,
+    "sort": _sort,
+    "tile": _tile,
 }

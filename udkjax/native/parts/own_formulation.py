@@ -83,7 +83,8 @@ class OwnAccelerations(ScaledAccelerations):
             c.put(i, self.right(f, i) + d.dot(d.row("D", i), free))
         for k, name in enumerate(self._numbers):
             d.row("numbers").put(k, self._array(f, name))
-        function = self._code.written(d.m, d.n, f.width, d.row("D").registers * d.vector // f.width).function
+        found = self._code.written(d.m, d.n, f.width, d.row("D").registers * d.vector // f.width)
+        function = found.within(d.layout.shapes["scratch"][1])
         function.call_in(f, *(d.row(name).address for name in ("mass", "force", "D", "b", "numbers", "scratch")))
         with f.each(d.n) as i:
             x.put(i, d.row("scratch").entry(i) - free.entry(i))
