@@ -163,7 +163,7 @@ def check_engines(case: Case) -> None:
         except ValueError as error:  # what cannot be done is said
             case.tally.leave_out(f"refused: {str(error).splitlines()[0][:100]}")
             return
-        if is_stiff and found.result == udk.Result.step_limit and found.settings["engine"] == "diffrax":
+        if is_stiff and found.result == udk.Result.step_limit and found.settings["engine"].startswith("diffrax"):
             case.tally.leave_out("stiff scenes that take a solver of diffrax too many steps, and it says so")
             return
         if ends_alike:
