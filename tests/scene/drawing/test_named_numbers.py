@@ -100,6 +100,25 @@ def test_named_numbers_are_changed_differentiated_and_mapped_as_others_are(mech)
     assert float(jax.jit(height)(40.0)) == pytest.approx(float(values[1]), rel=1e-14)
 
 
+def test_what_is_computed_within_a_trace_stays_concrete():
+    mech = udk.loads(TEXT)
+    jax.jit(lambda x: x + sum(map(jnp.sum, mech.parameters().values())) + jnp.sum(mech.with_parameters({"number.r": x}).q0))(40.0)
+    kept = mech.parameters(), mech.independent_parameters(), mech.q0, mech.v0, mech.bodies, mech.joints, mech.drivers
+    assert not any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(kept))
+
+
+def test_members_of_a_sweep_are_single_runs_whatever_their_size():
+    """The scales to which closing is relative are those of the member: the sides of this linkage all follow from one number."""
+    text = TEXT.replace('["rod", 80.0]', '["rod", "2*r"]').replace(
+        "mass = 1.0", "density = 7850.0\nwidth = 10.0\nthickness = 5.0"
+    )
+    mech, ts, sizes = udk.loads(text), np.linspace(0.0, 0.1, 3), [0.004, 40.0, 4e5]
+    found = udk.sweep(mech, {"number.r": sizes}, ts, progress=False)
+    for r, q in zip(sizes, np.asarray(found.q_end), strict=True):
+        alone = udk.simulate(mech.with_parameters({"number.r": r}), ts).q[-1]
+        np.testing.assert_allclose(q, alone, rtol=1e-10, atol=1e-12 * r)
+
+
 def test_runs_of_both_engines_and_their_derivatives_follow_a_named_number(mech):
     ts = np.linspace(0.0, 0.2, 3)
 

@@ -136,6 +136,13 @@ class Analysis(PrintsTable):
         if found is not None and (found.rank is None or found.coordinates > found.rank):
             model.require_masses(asked_by, "let motors determine the motion")
 
+    def with_numbers_of(self, mechanism: Mechanism) -> "Analysis":
+        """Return the analysis with the scales of the mechanism with other, traced numbers."""
+        own = traced_scales(mechanism)
+        if self.balance is not None:
+            own = own._replace(rank_tol=jnp.minimum(own.rank_tol, self.scales.rank_tol))
+        return replace(self, scales=own)
+
     def with_rows_of(self, mechanism: Mechanism, only_switched: bool = False) -> "Analysis":
         """Return the analysis of the mechanism with more constraints, of which rows are redundant is not known.
 
@@ -178,10 +185,7 @@ def analyse(mechanism: Mechanism) -> Analysis:
     """
     if not mechanism.is_concrete:
         if mechanism.origin is not None:
-            known, own = analyse(mechanism.origin.mechanism), traced_scales(mechanism)
-            if known.balance is not None:
-                own = own._replace(rank_tol=jnp.minimum(own.rank_tol, known.scales.rank_tol))
-            return replace(known, scales=own)
+            return analyse(mechanism.origin.mechanism).with_numbers_of(mechanism)
         mechanism = mechanism.without_origin
         count, names = 3 * len(mechanism.body_names), _row_names(mechanism)
         return Analysis(traced_scales(mechanism), count, names, *_rows_of_concrete_geometry(mechanism))

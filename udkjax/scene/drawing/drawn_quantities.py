@@ -10,6 +10,7 @@ import numpy as np
 from jax.core import Tracer
 
 from udkjax.annotations import TomlTable
+from udkjax.arrays import by_numpy
 from udkjax.printing import format_number
 from udkjax.scene.elements.fields import vector_as_angle
 from udkjax.scene.elements.profiles import AbstractProfile, profile_class
@@ -146,7 +147,7 @@ class Units:
             return Measured(named.value, "")
         kind = kind_of(named.unit)
         factor = conversion_factor(named.unit, kind) / self.size_of(kind)
-        return Measured(named.value if factor == 1.0 else named.value * factor, kind)
+        return Measured(named.value if factor == 1.0 else by_numpy(named.value) * factor, kind)
 
     def size_of(self, unit: str) -> float:
         """Return the size, in an SI unit, of the unit in which expressions have their values: the file's, or the SI unit."""

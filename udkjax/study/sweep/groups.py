@@ -7,7 +7,7 @@ import dataclasses
 import math
 from collections.abc import Mapping
 from functools import lru_cache
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -17,7 +17,7 @@ from jaxtyping import Array, Int, PyTree
 
 from udkjax.arrays import number
 from udkjax.devices import default_devices
-from udkjax.equations.rows.analysis import analyse, analysis_of
+from udkjax.equations.rows.analysis import Analysis, analysis_of
 from udkjax.equations.systems.general import ConstrainedSystem
 from udkjax.integrate.compiled_mechanism import reason_for_plain
 from udkjax.integrate.simulate import simulate
@@ -90,12 +90,6 @@ class GroupRun:
         analysis = analysis_of(fixed["mechanism"])
         self.redundant = redundant if redundant is not None or analysis is None else analysis.redundant_rows
         fixed["analysis"] = analysis and dataclasses.replace(analysis, redundant_rows=self.redundant)
-        if "mechanism" in self._own and analysis is not None:  # each mechanism has different scales
-            batched = self._own["mechanism"]
-            column = next(column for column in plan.columns if column.name == batched.axis)
-            analyses = [analyse(cast(Mechanism, column.choices[k])) for k in batched.places]
-            with_rows = [dataclasses.replace(analysed, redundant_rows=self.redundant) for analysed in analyses]
-            self._own["analysis"] = GroupChoices(batched.axis, *stack_choices(with_rows), batched.places)
         given = {setting for setting in fixed if setting not in self._own}
         arrays, self._static = eqx.partition({setting: fixed[setting] for setting in given}, eqx.is_array)
         targets = [target for column in self.numbers for target in (("",) if callable(column.of) else column.of)]
@@ -181,7 +175,10 @@ class GroupRun:
         """Return the stored variables of one member, with `shifts` (names,) added to the variables of differentiation."""
         shift = dict(zip(self.names, shifts, strict=True))
         mechanism = self.mechanism(shared, own, shift)
-        closure, settings = self._closure(shared, own, mechanism), self.settings(shared, own, shift)
+        settings = self.settings(shared, own, shift)
+        if self.varied and settings["analysis"] is not None:  # a member has scales of its own
+            settings["analysis"] = settings["analysis"].with_numbers_of(mechanism)
+        closure = self._closure(shared, mechanism, settings["analysis"])
         method, state = settings.get("method"), settings.pop("state", None)
         start: State | Closure | None = closure if state is None else state
         solution = simulate(mechanism, settings.pop("ts"), start, throw=False, **settings)
@@ -211,10 +208,10 @@ class GroupRun:
         """Return, for each derivative, its variable and the index of its variable of differentiation."""
         return {f"d_{of}_d_{by}": (of, k) for of in slopes if of not in (END, *self.seconds) for k, by in enumerate(self.names)}
 
-    def _closure(self, shared: Shared, own: Own, mechanism: StudyModel) -> Closure | None:
+    def _closure(self, shared: Shared, mechanism: StudyModel, analysis: Analysis | None) -> Closure | None:
         if shared.closure is not None or not self.assembled:
             return shared.closure
-        return close(mechanism, self.plan.ts[0], analysis=self._setting("analysis", shared, own))
+        return close(mechanism, self.plan.ts[0], analysis=analysis)
 
     def _setting(self, name: str, shared: Shared, own: Own) -> PyTree:
         if name in self._own:

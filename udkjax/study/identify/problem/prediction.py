@@ -159,6 +159,8 @@ class _MemberRun:
         member = member._replace(x=member.x + shift[:P], shift=member.shift + shift[P:])
         arrays, (rtol, atol) = shared
         mechanism, guess, settings = self.place(arrays, member)
+        if settings["analysis"] is not None:  # a member has scales of its own
+            settings["analysis"] = settings["analysis"].with_numbers_of(mechanism)
         closure = close(mechanism, member.runs.ts[0], guess, analysis=settings["analysis"])
         solution = simulate(mechanism, member.runs.ts, closure, rtol, atol, throw=False, **settings)
         predicted = {"y": measure(mechanism, solution, self.channels), "code": solution.code, "steps": solution.stats["steps"]}
