@@ -1,6 +1,7 @@
 """Requirements on arguments (real, finite, shape, sign), with errors that state the argument and its value."""
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
 from functools import wraps
 from inspect import isclass, signature
 from types import MappingProxyType
@@ -11,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from udkjax.arrays import is_traced, without_derivatives
+from udkjax.arrays import is_traced, is_within_jit, without_derivatives
 from udkjax.wording import abbreviate, article
 
 GivenArguments = Mapping[str, Any]  # all arguments of a call by name, including defaults
@@ -174,6 +175,8 @@ def require_output_times(name: str, value: Any, given: GivenArguments = NOTHING)
 def concrete_only(instead: str = "") -> Callable[[Callable[Arguments, Result]], Callable[Arguments, Result]]:
     """Return a decorator of functions that compute with NumPy; an argument with a traced number raises a `TypeError`.
 
+    Within the trace of another function, they compute with concrete numbers as outside.
+
     Args:
         instead: The functions to use under jit and vmap, for the message; empty: there are none.
     """
@@ -188,7 +191,8 @@ def concrete_only(instead: str = "") -> Callable[[Callable[Arguments, Result]], 
                 if _has_traced_numbers(value):
                     problem = f"{name} must be concrete, not traced: {function.__name__} needs concrete numbers"
                     raise ArgumentTypeError(f"{problem}; {cure}")
-            return function(*args, **kwargs)
+            with jax.ensure_compile_time_eval() if is_within_jit() else nullcontext():
+                return function(*args, **kwargs)
 
         return call
 

@@ -125,8 +125,8 @@ class CirclesPin(AbstractPin):
 
     def place(self, places):
         start, end = (places[name] for name in self.from_)
-        (r, s), axis = by_numpy(self.length), end - start
-        xp, d = array_namespace(axis, self.length), norm(axis)
+        length, axis = by_numpy(self.length), end - start
+        (r, s), xp, d = length, array_namespace(axis, length), norm(axis)
         unit = axis / d
         x = (d**2 + r**2 - s**2) / (2 * d)
         product, touches = _heron(d, r, s)
