@@ -14,7 +14,6 @@ import numpy as np
 from udkjax.positions.assembling.assembly import assemble
 from udkjax.scene.drawing import Drawing
 from udkjax.scene.drawing.drawn_forces import shift_motion
-from udkjax.scene.drawing.mistakes import SAME_PLACE
 from udkjax.scene.elements.bodies import GROUND, Body
 from udkjax.scene.elements.couplings import Gear
 from udkjax.scene.elements.drivers import Driver, Polynomial
@@ -23,6 +22,8 @@ from udkjax.scene.elements.joints import Distance, Joint, Prismatic, Revolute, S
 from udkjax.scene.files import dumps
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.tables.checks import SceneError
+
+SAME_PLACE = 1e-9  # fraction of the extent: joints that are closer share a pin
 
 
 def drawing_text_of(mechanism: Mechanism) -> str:

@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.core import Tracer
 
 import udkjax as udk
 from udkjax.scene.numbers.formula import Measured, evaluate, names_in
@@ -104,7 +105,7 @@ def test_what_is_computed_within_a_trace_stays_concrete():
     mech = udk.loads(TEXT)
     jax.jit(lambda x: x + sum(map(jnp.sum, mech.parameters().values())) + jnp.sum(mech.with_parameters({"number.r": x}).q0))(40.0)
     kept = mech.parameters(), mech.independent_parameters(), mech.q0, mech.v0, mech.bodies, mech.joints, mech.drivers
-    assert not any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(kept))
+    assert not any(isinstance(x, Tracer) for x in jax.tree.leaves(kept))
 
 
 def test_members_of_a_sweep_are_single_runs_whatever_their_size():

@@ -24,7 +24,7 @@ from udkjax.wording import quote
 
 DrawnGroups = Mapping[str, Mapping[str, Any]]  # elements by section and name
 
-# Tolerance relative to the size of a drawing or a scene. Closer points count as coincident, smaller areas as zero.
+# Tolerance relative to the largest distance between two pins. Closer points count as coincident, smaller areas as zero.
 SAME_PLACE = 1e-9
 # A pin that is farther from the other pins than this many times their largest distance is probably in another unit, such as
 # millimetres in a file in metres (1,000). Smaller factors, such as 10 (cm and mm), are not recognized.

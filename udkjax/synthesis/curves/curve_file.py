@@ -5,10 +5,10 @@ from pathlib import Path
 
 import numpy as np
 
-from udkjax.scene.outlines.contours import JOINED, size_of_pieces
 from udkjax.scene.outlines.svg import read_svg
 
 FRACTIONS = np.linspace(0.0, 1.0, 49)  # of an arc or a spline
+NEXT = 1e-6  # of the length of the next piece: ends nearer than this meet
 
 
 def read_curve_file(file: Path) -> np.ndarray:
@@ -26,9 +26,9 @@ def read_curve_file(file: Path) -> np.ndarray:
     drawn, _, problems = read_svg(file)
     if problems or not drawn:
         raise ValueError(f"{file.name} {f'is {problems[0]}' if problems else 'draws nothing'}")
-    pieces, near = [one.piece.at(FRACTIONS)[0] for one in drawn], JOINED * size_of_pieces(drawn)
+    pieces = [one.piece.at(FRACTIONS)[0] for one in drawn]
     for k in range(1, len(pieces)):
-        if np.hypot(*(pieces[k][0] - pieces[k - 1][-1])) > near:
+        if np.hypot(*(pieces[k][0] - pieces[k - 1][-1])) > NEXT * np.ptp(pieces[k], axis=0).max():
             raise ValueError(f"{file.name} must be one stroke: the pen is lifted between {drawn[k - 1].name} and {drawn[k].name}")
     return np.concatenate(pieces)
 

@@ -4,10 +4,11 @@ import numpy as np
 from jaxtyping import Float
 
 from udkjax.annotations import Numbers
-from udkjax.scene.drawing.mistakes import SAME_PLACE
 from udkjax.scene.elements.bodies import GROUND
 from udkjax.scene.elements.forces import Spring
 from udkjax.scene.mechanism import Mechanism
+
+SAME_PLACE = 1e-9  # attachments closer than this, relative to the largest coordinate, are one point
 
 
 def body_points(mechanism: Mechanism) -> dict[str, Float[np.ndarray, "points 2"]]:

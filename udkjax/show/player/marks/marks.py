@@ -12,7 +12,6 @@ from jaxtyping import Float
 
 from udkjax.annotations import JsonObject, Numbers
 from udkjax.integrate.events.law.conditions import Gap
-from udkjax.scene.drawing.mistakes import SAME_PLACE
 from udkjax.scene.elements.bodies import GROUND
 from udkjax.scene.elements.couplings import Coupling, Gear, Rack, Screw
 from udkjax.scene.elements.drivers import Driver
@@ -23,7 +22,7 @@ from udkjax.scene.elements.joints import Cam, Distance, Joint, Prismatic, Revolu
 from udkjax.scene.elements.rolling import KnifeEdge, Wheel
 from udkjax.scene.mechanism import Mechanism
 from udkjax.show.player.marks.mark_kinds import MarkKind
-from udkjax.show.player.marks.mark_places import body_points, corners_of, distinct, in_frame, to_ground
+from udkjax.show.player.marks.mark_places import SAME_PLACE, body_points, corners_of, distinct, in_frame, to_ground
 
 Mark = JsonObject
 BodyPoints = Mapping[str, Numbers]  # points (n, 2) by body
