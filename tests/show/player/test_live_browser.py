@@ -72,6 +72,7 @@ def test_the_motion_is_that_of_python(opened, name):
     energy, efforts = udk.energy(other, run), udk.efforts(other, run)
     with opened(animation) as page:
         page.evaluate(f"{LIVE}.change({given})")
+        until(page, f"{LIVE}.runs[0].run.ts.length === {len(TS)}")  # a long run is shown while it grows
         length = float(udk.analyse(mechanism).length)
         assert_allclose(shown_q(page), np.asarray(run.q).reshape(len(TS), -1), rtol=0, atol=1e-7 * max(length, 1.0))
         unit = max(1.0, float(np.abs(energy.total).max()))
