@@ -700,6 +700,19 @@ test("the pins of scissors move together when a length of an arm is typed", () =
   near([size(found, ["D", "E"]), C[1], B[0] - C[0], B[1] - D[1], E[1] - D[1]], [0.12, 0, 0, 0, 0]);  // the table stays level
 });
 
+test("a bar of a long truss takes a typed length, and all others keep theirs", () => {
+  const pins = {}, link = [], size = (document, {pins: [a, b]}) => Math.hypot(...d.placeOf(document, a).map((x, k) => x - d.placeOf(document, b)[k]));
+  for (let k = 0; k < 60; k++) {
+    pins[`P${k}`] = [40 * k, k % 2 ? 30 : 0];
+    if (k) link.push({name: `bar${k}`, pins: [`P${k - 1}`, `P${k}`]});
+    if (k > 1) link.push({name: `side${k}`, pins: [`P${k - 2}`, `P${k}`]});
+  }
+  const truss = freeze({units: {length: "mm"}, ground: ["P0", "P1"], pins, link}), bar = link.find(({name}) => name === "bar40");
+  const {document, note} = withBar(truss, bar, 0.06, Math.atan2(-30, 40));
+  assert.equal(note, "");
+  for (const one of link) near([size(document, one) / 0.06], [one === bar ? 1 : size(truss, one) / 0.06]);
+});
+
 test("it is said which dimension gives way", () => {
   const {note, document} = typed(LOOP, 2, 80, 1.2);
   assert.match(note, /^link2 is now [0-9.]+ mm$/);

@@ -3,7 +3,8 @@
 import {movePin, pinsOf, placeOf} from "./document.js";
 import {inOrder} from "./pin_forms.js";
 
-const ROUNDS = 40;  // of Newton's method
+const MOST = 150;  // conditions: more would take longer than a hand waits
+const ROUNDS = 16;  // of Newton's method
 const CLOSED = 1e-13;  // relative to the size of the drawing: errors of closed conditions
 const STEP = 1e-6;  // relative to it: of differences
 const GRAIN = 1e-11;  // relative to it: finer digits of places are errors of rounding
@@ -11,11 +12,12 @@ const DEPENDENT = 1e-12;  // relative to the largest: added to the diagonal, so 
 
 /**
  * The drawing with its pins moved, except for those that are `held`, so that all `conditions` hold: {pins, error}, the names of the pins, and a
- * function (m) of the places by name. Null if none is near. With the Jacobian J of the errors e, a step is -J^T (J J^T)^-1 e.
+ * function (m) of the places by name. Null if none is near, or there are too many. With the Jacobian J of the errors e, a step is -J^T (J J^T)^-1 e.
  */
 export function fitted(document, conditions, held) {
+  if (conditions.length > MOST) return null;
   const names = Object.keys(pinsOf(document)).filter(name => placeOf(document, name)), at = Object.fromEntries(names.map(name => [name, placeOf(document, name)]));
-  const size = Math.max(...[0, 1].map(k => Math.max(...names.map(name => at[name][k])) - Math.min(...names.map(name => at[name][k]))));
+  const size = Math.max(...[0, 1].map(k => Math.max(...names.map(name => at[name][k])) - Math.min(...names.map(name => at[name][k])))) || 1;
   for (let round = 0; round < ROUNDS; round++) {
     const errors = conditions.map(({error}) => error(at));
     if (!errors.every(Number.isFinite)) return null;
