@@ -95,7 +95,6 @@ def test_derivatives_of_a_pseudoinverse_in_machine_code(derivative):
     assert_allclose(own, other, rtol=1e-5, atol=1e-7)
 
 
-@pytest.mark.slow
 def test_a_pseudoinverse_as_one_of_several():
     """In lanes with another method, and for the matrix of a formulation."""
     run = lambda number: angles(1.2, udk.OneOf(methods=(BenIsrael(), udk.SVD()), number=number), engine="native")  # noqa: E731

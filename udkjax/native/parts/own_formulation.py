@@ -84,7 +84,7 @@ class OwnAccelerations(ScaledAccelerations):
         for k, name in enumerate(self._numbers):
             d.row("numbers").put(k, self._array(f, name))
         found = self._code.written(d.m, d.n, f.width, d.row("D").registers * d.vector // f.width)
-        function = found.within(d.layout.shapes["scratch"][1])
+        function = found.within(d.columns("scratch"))
         function.call_in(f, *(d.row(name).address for name in ("mass", "force", "D", "b", "numbers", "scratch")))
         with f.each(d.n) as i:
             x.put(i, d.row("scratch").entry(i) - free.entry(i))

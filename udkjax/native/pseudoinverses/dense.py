@@ -201,6 +201,10 @@ class DenseMatrices:
 
         self.over_registers(y.registers, copy)
 
+    def columns(self, name: str) -> int:
+        """Return the number of columns of a matrix."""
+        return self.layout.shapes[self._name(name)][1]
+
     def row(self, name: str, i: Operand = 0) -> MatrixRow:
         """Return row i of a matrix."""
         name = self._name(name)

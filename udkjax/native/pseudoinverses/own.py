@@ -55,7 +55,7 @@ class OwnCode(DenseMethod):
         f, scratch = d.f, d.row("scratch")
         d.row("tol").put(0, d.tol)
         found = self.written(d.m, d.n, f.width, d.row("D").registers * d.vector // f.width)
-        function = found.within(d.layout.shapes["scratch"][1])
+        function = found.within(d.columns("scratch"))
         function.call_in(f, d.row("D").address, d.row("tol").address, scratch.address)
         with f.each(d.n) as i:  # the function stores rows of D^+ without gaps; padded rows are filled here
             row = d.row("plus", i)
