@@ -8,6 +8,7 @@ import pytest
 import udkjax as udk
 from tests.contrast import CONTRAST, LEAST_CONTRAST
 from tests.studio.browsing import studio_page
+from udkjax.study.worked.loops import drawing_of
 
 FOUR_BAR = """format = 2
 units = {length = "mm", angle = "deg"}
@@ -63,7 +64,7 @@ def test_answers_and_named_numbers_stand_in_the_panels(studio):
     studio.page.keyboard.press("Enter")
     studio.settle()
     assert studio.document["pins"]["B"]["length"] == ["3*r", "2*r"]
-    lengths = udk.loads(studio.js("studio.state.text")).drawing.length_texts()
+    lengths = drawing_of(udk.loads(studio.js("studio.state.text"))).length_texts()
     assert [lengths[name] for name in ("crank", "coupler", "rocker")] == ["O-A 42 mm", "A-B 126 mm", "C-B 84 mm"]
     before = studio.document["pins"]
     studio.js("studio.commit({...studio.document, pins: {...studio.document.pins}})")
@@ -134,7 +135,7 @@ def test_a_mechanism_is_copied_by_keys_and_its_copy_moves(studio):
     assert len(studio.document["link"]) == 6
     assert [motor["pin"] for motor in studio.document["motor"]] == ["O", studio.document["link"][3]["pins"][0]]
     mechanism = udk.loads(studio.js("studio.state.text"))
-    lengths = mechanism.drawing.length_texts()
+    lengths = drawing_of(mechanism).length_texts()
     assert [lengths[link["name"]].split()[-2] for link in studio.document["link"]] == ["40", "120", "80"] * 2
     studio.page.keyboard.press("Control+x")
     studio.settle()
