@@ -229,7 +229,7 @@ def relative_width(mech: udk.Mechanism, records: list[Any], names: list[str]) ->
 # --- the study
 
 
-def study(smoke: bool, sets: int = 40, laws: int = 40, repetitions: int = 6, scenes: int = 5) -> xarray.Dataset:
+def study(smoke: bool, sets: int = 200, laws: int = 200, repetitions: int = 50, scenes: int = 5) -> xarray.Dataset:
     """Costs of scenes, ranks of calibration sets, right laws, numbers of records, and continued folders."""
     sets, laws, repetitions, scenes = (4, 4, 1, 1) if smoke else (sets, laws, repetitions, scenes)
     costs_of = {}
