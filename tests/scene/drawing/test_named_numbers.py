@@ -101,6 +101,20 @@ def test_named_numbers_are_changed_differentiated_and_mapped_as_others_are(mech)
     assert float(jax.jit(height)(40.0)) == pytest.approx(float(values[1]), rel=1e-14)
 
 
+@pytest.mark.parametrize(
+    ("value", "said"),
+    [
+        (udk.Held([1.0, 2.0], 0.1), "number.r: must be a number, not Held"),
+        (np.nan, "number.r: must be finite, not nan"),
+        (1e300, "pins.[AB]: its place is no finite number"),
+        (-40.0, "pins.A.length: must be > 0, not -0.04"),
+    ],
+)
+def test_named_numbers_that_cannot_be_are_named(mech, value, said):
+    with pytest.raises(udk.SceneError, match=said):
+        mech.with_parameters({"number.r": value})
+
+
 def test_what_is_computed_within_a_trace_stays_concrete():
     mech = udk.loads(TEXT)
     jax.jit(lambda x: x + sum(map(jnp.sum, mech.parameters().values())) + jnp.sum(mech.with_parameters({"number.r": x}).q0))(40.0)

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from udkjax.annotations import NumberLike, Numbers, TomlTable
-from udkjax.arrays import by_numpy, make_module, number
+from udkjax.arrays import by_numpy, is_traced, make_module, number
 from udkjax.printing import PrintedTable, has_numbers
 from udkjax.scene.drawing.drawing_reader import (
     BY_HAND,
@@ -286,6 +286,12 @@ class Drawing(AbstractDrawing):
 
     def with_groups(self, groups: Mapping[str, Mapping[str, Any]], gravity: Array) -> "Drawing":
         """Return the drawing with other numbers in its elements; raise a `SceneError` if they are not valid."""
+        named = [(name, x.value) for name, x in groups["number"].items() if x.value is not None]
+        wrong = [f"number.{name}: must be a number, not {abbreviate(x)}" for name, x in named if not is_number(x)]
+        known = [(name, x) for name, x in named if is_number(x) and not is_traced(x)]
+        wrong += [f"number.{name}: must be finite, not {np.asarray(x)}" for name, x in known if not np.all(np.isfinite(x))]
+        if wrong:
+            raise SceneError(wrong, self.name)
         plain = make_module(Drawing, **vars(self) | {"_elements": _in_order(groups)[1]}).groups if self.formulas else groups
         drawn = [
             entry for section, group in plain.items() if section not in ("pin", "number") for entry in _entries(section, group)

@@ -145,14 +145,18 @@ def pin_mistakes(pins: Mapping[str, AbstractPin], units: Units) -> Iterator[str]
     places: dict[str, PointArray] = {}
     for name in order:
         pin = with_concrete_numbers(pins[name])
-        if reason := pin.misplacement(places, lambda x: units.text(x, "m")):
+        with np.errstate(all="ignore"):
+            reason = pin.misplacement(places, lambda x: units.text(x, "m"))
+        if reason:
             yield f"{where('pin', 0, name)}: {reason}"
             return  # pins that refer to this one have no place
         with np.errstate(all="ignore"):
             places[name] = pin.place(places)
         if not np.all(np.isfinite(places[name])):
-            pair = next(pair for pair in combinations(pin.references, 2) if np.array_equal(places[pair[0]], places[pair[1]]))
-            yield f"{where('pin', 0, name)}: {quote(pair[0])} and {quote(pair[1])} are at the same place: they have no direction"
+            same = next((p for p in combinations(pin.references, 2) if np.array_equal(places[p[0]], places[p[1]])), None)
+            overflows = "its place is no finite number: lengths are too large or too small; give them in their unit"
+            at_one_place = same and f"{quote(same[0])} and {quote(same[1])} are at the same place: they have no direction"
+            yield f"{where('pin', 0, name)}: {at_one_place or overflows}"
             return
 
 
