@@ -215,3 +215,21 @@ def test_what_no_sample_meets_is_said(four_bar):
     assert "No sample is within the limits" in str(found)
     with pytest.raises(ValueError, match="outside the limits without any deviation"):
         found.cheapest(0.9)
+
+
+def test_what_varies_by_rounding_alone_has_no_shares():
+    """The size of a drawing changes no angle."""
+    mech = udk.Drawing(
+        pins={"A": [0, 0], "B": udk.polar("A", "r", 60), "C": udk.circles("BD", ("3*r", "2*r"), "left"), "D": ["3*r", 0]},
+        links={name: {"pins": list(ends), "mass": 1} for name, ends in (("crank", "AB"), ("rod", "BC"), ("rocker", "CD"))},
+        ground=["A", "D"],
+        motors={"motor": {"pin": "A", "speed": "60 rpm"}},
+        units={"length": "mm", "angle": "deg"},
+        numbers={"r": 40},
+    ).mechanism()
+    found = udk.tolerances(mech, {"number.r": 0.1}, ["range(body.rocker.angle)", "range(pin.C.x)"], samples=500, progress=False)
+    angle, place = found.names
+    assert found.shares[angle]["number.r"].total == 0.0 and found.second_order.trusted[angle]
+    assert found.shares[place]["number.r"].total == pytest.approx(1.0)
+    row = next(line for line in str(found).splitlines() if angle in line)
+    assert row.split()[3] == "0" and row.endswith("none varies it") and "Not quadratic" not in str(found)

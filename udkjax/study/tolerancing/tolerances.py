@@ -5,7 +5,7 @@ from functools import cached_property
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from udkjax.annotations import Numbers
 from udkjax.argument_types import NOT_NEGATIVE_COUNT
@@ -26,6 +26,7 @@ from udkjax.wording import quote, suggestion
 
 QUANTILES = (0.001, 0.01, 0.05, 0.5, 0.95, 0.99, 0.999)
 TRUSTED = 0.05  # largest difference between mean or standard deviation and those of samples, in standard deviations
+CONSTANT = 1e-12  # standard deviation of a measure, relative to its largest value, up to which it is rounding
 AT_ONCE = 2**16  # samples between reports of progress
 FOR_SEARCH = 20_000  # samples with which the cheapest tolerances are found
 
@@ -113,14 +114,19 @@ class ToleranceAnalysis:
         mean, deviation = model.mean, np.sqrt(own.sum(1) + pairs.sum((1, 2)) / 2.0)
         of_samples, spread = self._reached.mean(0), self._reached.std(0)
         close = np.maximum(np.abs(mean - of_samples), np.abs(deviation - spread)) <= TRUSTED * spread
-        trusted = {name: bool(x) for name, x in zip(self.names, close, strict=True)}
+        trusted = {name: bool(x) for name, x in zip(self.names, close | self._is_constant, strict=True)}
         return SecondOrder(self._by_name(mean), self._by_name(deviation), trusted)
+
+    @property
+    def _is_constant(self) -> Bool[np.ndarray, "measures"]:
+        """Which measures vary by rounding errors alone."""
+        return self._reached.std(0) <= CONSTANT * np.abs(self._reached).max(0, initial=0.0)
 
     @cached_property
     def shares(self) -> dict[str, dict[str, Share]]:
         """The share of each deviation in the variance of each measure, by the second-order terms."""
         own, pairs = self._parts
-        variance = np.maximum(own.sum(1) + pairs.sum((1, 2)) / 2.0, 1e-300)[:, None]
+        variance = np.where(self._is_constant, np.inf, np.maximum(own.sum(1) + pairs.sum((1, 2)) / 2.0, 1e-300))[:, None]
         first, total = own / variance, (own + pairs.sum(2)) / variance
         sources = [source.name for source in self._numbers.sources]
         return {
@@ -184,11 +190,12 @@ class ToleranceAnalysis:
         rows, low = [], self.quantiles((0.001, 0.999))
         for name in self.names:
             worst = sorted(self.shares[name].items(), key=lambda item: -item[1].total)[:3]
-            shares = ", ".join(f"{source} {100 * share.total:.0f} %" for source, share in worst)
+            shares = ", ".join(f"{source} {100 * share.total:.0f} %" for source, share in worst if share.total)
             outside = f"{100 * self.outside[name]:.3g} %" if name in self.outside else "no limit"
             place = self.names.index(name)
-            rows.append((name, f"{self.nominal[place]:.6g}", f"{self.mean[name]:.6g}", f"{self.standard_deviation[name]:.3g}",
-                         f"{low[name][0]:.6g}", f"{low[name][1]:.6g}", outside, shares))  # fmt: skip
+            deviation = 0.0 if self._is_constant[place] else self.standard_deviation[name]
+            rows.append((name, f"{self.nominal[place]:.6g}", f"{self.mean[name]:.6g}", f"{deviation:.3g}",
+                         f"{low[name][0]:.6g}", f"{low[name][1]:.6g}", outside, shares or "none varies it"))  # fmt: skip
         heads = "measure", "nominal", "mean", "standard deviation", "0.1 %", "99.9 %", "outside", "share of the variance"
         remarks = []
         if self.not_assembled:
