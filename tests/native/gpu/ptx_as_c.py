@@ -157,9 +157,11 @@ def as_c(code: str) -> str:
     lines += [f"{head};" for head in heads]
     depth = result = 0
     for line in (x.strip().rstrip(";") for x in re.sub(r";(?=.)", ";\n", code).split("\n")):
-        if table := re.match(r"(?:\.visible )?\.(?:global|shared) \.align (\d+) \.b8 (\w+)\[(\d+)\](?: = (\{.*\}))?", line):
-            value = f" = {table[4]}" if table[4] else ""
-            lines.append(f"static uint8_t {table[2]}[{table[3]}] __attribute__((aligned({table[1]}))){value};")
+        if table := re.match(
+            r"(?:\.visible )?\.(?:global|shared) \.align (\d+) \.([bu])(\d+) ([\w$]+)\[(\d+)\](?: = (\{.*\}))?", line
+        ):
+            value = f" = {table[6]}" if table[6] else ""
+            lines.append(f"static uint{table[3]}_t {table[4]}[{table[5]}] __attribute__((aligned({table[1]}))){value};")
         elif line.startswith("DEFINE"):
             result = returns[int(line.split()[1])]
             lines.append(heads[int(line.split()[1])])

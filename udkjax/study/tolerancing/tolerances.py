@@ -119,7 +119,7 @@ class ToleranceAnalysis:
 
     @property
     def _is_constant(self) -> Bool[np.ndarray, "measures"]:
-        """Which measures vary by rounding errors alone."""
+        """Mark the measures that vary by rounding errors alone."""
         return self._reached.std(0) <= CONSTANT * np.abs(self._reached).max(0, initial=0.0)
 
     @cached_property
