@@ -8,7 +8,7 @@ import numpy as np
 from udkjax.scene.outlines.svg import read_svg
 
 FRACTIONS = np.linspace(0.0, 1.0, 49)  # of an arc or a spline
-NEXT = 1e-6  # of the length of the next piece: ends nearer than this meet
+LIFTED = 1e-6  # of the length of the next piece: a pen that moves farther is lifted
 
 
 def read_curve_file(file: Path) -> np.ndarray:
@@ -28,7 +28,7 @@ def read_curve_file(file: Path) -> np.ndarray:
         raise ValueError(f"{file.name} {f'is {problems[0]}' if problems else 'draws nothing'}")
     pieces = [one.piece.at(FRACTIONS)[0] for one in drawn]
     for k in range(1, len(pieces)):
-        if np.hypot(*(pieces[k][0] - pieces[k - 1][-1])) > NEXT * np.ptp(pieces[k], axis=0).max():
+        if np.hypot(*(pieces[k][0] - pieces[k - 1][-1])) > LIFTED * np.ptp(pieces[k], axis=0).max():
             raise ValueError(f"{file.name} must be one stroke: the pen is lifted between {drawn[k - 1].name} and {drawn[k].name}")
     return np.concatenate(pieces)
 
