@@ -26,7 +26,8 @@ def gaps(
     Args:
         scene: the mechanism.
         driver: a driver of the scene, by default its only one; or a coordinate: body.crank.angle, joint.B.angle, pin.C.x.
-        first: first value, such as "60 deg"; by default the whole range, one turn or from toggle to toggle.
+        first: first value, such as "60 deg"; by default the whole range, one turn or from toggle to toggle. Values are counted as
+            by `udkjax kinematics`.
         last: last value; by default the whole range.
         width: width of all links, such as "12 mm", instead of those that are drawn.
         layers: also find the fewest layers in which nothing hits anything; then links that touch are no failure.
@@ -61,4 +62,5 @@ def gaps(
         text += f"\n\n{passed!r}"
     show(results, text, json)
     if found.contacts and not layers:
-        fail(f"{' and '.join(found.least.pair)} overlap by {-float(found.least.distance):.6g} m")
+        overlap = counted.units.text(-float(found.least.distance), "m")
+        fail(f"{' and '.join(found.least.pair)} overlap by {overlap}")

@@ -30,13 +30,16 @@ def tolerances(
 ) -> None:
     """Find how often a mechanism made with tolerances stays within limits, which tolerances matter, and which cost least.
 
+    Plain numbers are in the unit of the drawing, or in SI units without one, and so are the printed ones.
+
     Args:
         scene: the mechanism.
         tol: tolerances: "length(crank)=0.05 mm", "pin.D[0]=h9", or "clearance(B)=0.02 mm", the play of a pin.
         measure: measures over the drive: "range(body.rocker.angle)", "deviation(pin.C)"; max, min, range, mean, rms, first, last.
         limit: limits of measures: "deviation(pin.C)=0.5 mm".
         driver: a driver of the scene, by default its only one; or a coordinate, such as body.crank.angle.
-        first: first value of the driver (rad, m); by default, positions over a turn from the drawn one.
+        first: first value of the driver, such as "60 deg", counted as by `udkjax kinematics`; by default, every 5 degrees of a
+            turn from the drawn position.
         last: last value.
         count: number of values.
         samples: number of samples.
@@ -53,7 +56,6 @@ def tolerances(
 
     import udkjax as udk
     from udkjax.positions.answers.counting import Count
-    from udkjax.printing import PrintedTable, text_table
 
     chosen, values = choose_driver(mech, driver), None
     if first is not None and last is not None:
@@ -63,7 +65,7 @@ def tolerances(
     for name, text in _pairs("--tol", tol):
         of_pin = name.startswith("clearance(") and name.endswith(")")
         given[name[10:-1] if of_pin else name] = udk.PinClearance(text) if of_pin else text
-    limits = {name: float(text) if _is_number(text) else text for name, text in _pairs("--limit", limit)}
+    limits = dict(_pairs("--limit", limit))
     found = udk.tolerances(
         mech, given, list(measure), drive=chosen, values=values, limits=limits, samples=samples, seed=seed,
         progress=False if quiet else None,
@@ -76,9 +78,7 @@ def tolerances(
     text = str(found)
     if cheapest is not None:
         best = results["cheapest"] = found.cheapest(cheapest)
-        rows = [(name, f"{low:.4g}", f"{high:.4g}") for name, (low, high) in best.deviations.items()]
-        title = f"cheapest tolerances with a yield of {100 * best.yield_:.4g} %: {best.cost:.3g} times the cost"
-        text += "\n" + text_table(PrintedTable(title, rows, ("number", "lower", "upper deviation (SI)")))
+        text += f"\n{best}"
     if plot is not None:
         from udkjax.show.figures import tolerances_figure
 
@@ -95,11 +95,3 @@ def _pairs(option: str, given: Iterable[str]) -> list[tuple[str, str]]:
             refuse(f'{option} "{text}": write NAME=VALUE')
         pairs.append((name, value))
     return pairs
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True

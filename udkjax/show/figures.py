@@ -76,10 +76,11 @@ def tolerances_figure(found: ToleranceAnalysis, title: str = "") -> Figure:
     for k, (name, (samples, bars)) in enumerate(
         zip(found.names, figure.subplots(len(found.names), 2, squeeze=False), strict=True)
     ):
-        samples.hist(found.measured[np.isfinite(found.measured[:, k]), k], bins=80, color=COLOURS[0])
+        unit, size = found.shown(name)
+        samples.hist(found.measured[np.isfinite(found.measured[:, k]), k] / size, bins=80, color=COLOURS[0])
         for edge in found.limits_of(name):
-            samples.axvline(edge, color=COLOURS[1])
-        samples.set(xlabel=name, ylabel="samples")
+            samples.axvline(edge / size, color=COLOURS[1])
+        samples.set(xlabel=f"{name} ({unit})" if unit else name, ylabel="samples")
         shares = found.shares[name]
         bars.barh(list(shares), [100 * share.total for share in shares.values()], color=COLOURS[2])
         bars.set(xlabel="share of the variance (%)")

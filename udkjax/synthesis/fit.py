@@ -7,9 +7,7 @@ import numpy as np
 from udkjax.positions.answers.characteristics import characteristics
 from udkjax.positions.assembling.coordinates import element_of
 from udkjax.printing import format_number
-from udkjax.scene.drawing import Drawing
 from udkjax.scene.drawing.drawn_quantities import Units
-from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.tables.checks import SceneError
 from udkjax.synthesis.curve_goal import CurveGoal
 from udkjax.synthesis.designs import FoundDesign
@@ -70,14 +68,9 @@ def deviation_of(design: FoundDesign, goal: Goal) -> Deviation:
     return Deviation(off, way, angle, "m", float(np.linalg.norm(np.ptp(places, axis=0))))
 
 
-def units_of_drawing(mechanism: Mechanism) -> Units:
-    """Return the units in which a mechanism was drawn; those of a scene of bodies are SI units."""
-    return Units(dict(mechanism.drawing.units) if isinstance(mechanism.drawing, Drawing) else None)
-
-
 def design_lines(design: FoundDesign, goal: Goal) -> dict[str, str]:
     """Return a design as texts by title: deviation, type, transmission angle, pins and lengths, in the units of its drawing."""
-    mechanism, units = design.mechanism, units_of_drawing(design.mechanism)
+    mechanism, units = design.mechanism, Units.of(design.mechanism.drawing)
     deviation = deviation_of(design, goal)
     lines = {"deviation": deviation.words(units) if deviation.is_fit else f"not a fit: {deviation.words(units)}"}
     try:

@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 
 from udkjax.positions.following.free_numbers import FreeNumbers
 from udkjax.requirements import require_number
+from udkjax.scene.drawing.drawn_quantities import Units
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.numbers.number_fields import split_index
 from udkjax.scene.reshaping import length_of, with_length
@@ -122,7 +123,7 @@ class MadePieces:
                 if name.startswith("pin."):
                     cure = "name lengths, such as length(crank), or a hole, such as joint.C.points[0]"
                     raise ValueError(f"a pin changes all of its links, and otherwise in another position: {cure}")
-                tolerance = read_tolerance(given[name], unit, nominal)
+                tolerance = read_tolerance(given[name], unit, nominal, Units.of(mechanism.drawing))
                 middle, size = tolerance.middle_and_deviation(unit)
             except (TypeError, ValueError) as problem:
                 problems.append(f"tolerances: {quote(name)}: {problem}")

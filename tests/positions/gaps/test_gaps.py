@@ -19,11 +19,12 @@ from udkjax.positions.gaps.shapes import convex_pieces, hull
 FOUR_BAR = {"O": [0.0, 0.0], "A": [0.03, 0.04], "B": [0.16, 0.11], "C": [0.18, 0.0]}
 
 
-def four_bar(widths=(0.01, 0.012, 0.015), pins=FOUR_BAR, ground=("O", "C"), more=None):
+def four_bar(widths=(0.01, 0.012, 0.015), pins=FOUR_BAR, ground=("O", "C"), more=None, units=None):
     w = dict(zip(("crank", "coupler", "rocker"), widths, strict=True))
     ends = {"crank": ["O", "A"], "coupler": ["A", "B"], "rocker": ["B", "C"]}
-    links = {name: udk.Link(ends[name], mass=1.0, width=w[name]) for name in w} | (more or {})
-    return udk.Drawing(pins=pins, links=links, ground=list(ground), motors={"motor": {"pin": "O", "speed": 1.0}}).mechanism()
+    links = {name: {"pins": ends[name], "mass": 1} | ({} if w[name] is None else {"width": w[name]}) for name in w} | (more or {})
+    motors = {"motor": {"pin": "O", "speed": "1 rad/s"}}
+    return udk.Drawing(pins=pins, links=links, ground=list(ground), motors=motors, units=units or {}).mechanism()
 
 
 def supports(points, n):
@@ -281,12 +282,29 @@ def test_wrong_input_is_named_with_its_cure(case):
         call()
 
 
+def test_gaps_are_printed_in_the_units_of_the_drawing():
+    pins = {name: 1e3 * np.array(place) for name, place in FOUR_BAR.items()}
+    mech, plain = four_bar((10.0, 12.0, 15.0), pins, units={"length": "mm"}), udk.gaps(four_bar())
+    found, wide = udk.gaps(mech), four_bar((100.0, 12.0, 120.0), pins, units={"length": "mm"})
+    assert str(found).splitlines()[0] == "least gaps between links, by the angle of O-A from the x axis"
+    assert f"{1e3 * plain.least.distance:.6g} mm  at  {np.degrees(found.least.value):.6g} deg" in str(found)
+    (touch,) = udk.gaps(wide).contacts
+    ends = (f"{np.degrees(x):.6g} deg" for x in touch[1:])
+    assert "crank and rocker touch from {} to {}".format(*ends) in str(udk.gaps(wide))
+    run = udk.kinematics(mech, "motor", np.linspace(3.0, 4.5, 31))
+    assert f"mm  at  {np.degrees(found.least.value):.5g}" in str(udk.gaps(mech, run=run))
+    in_time = udk.gaps(mech, run=udk.simulate(mech, np.linspace(0.0, 6.0, 61)))
+    assert str(in_time).splitlines()[0] == "least gaps between links, by time" and f"{in_time.least.value:.6g} s" in str(in_time)
+
+
 def test_the_command_reports_gaps_layers_and_contacts(tmp_path, capsys):
     scene = tmp_path / "scene.toml"
     udk.save(four_bar(), scene)
     assert udkjax("gaps", scene, "--json") == 0
     results = json.loads(capsys.readouterr().out)
     assert results["gaps"][0]["distance"] == pytest.approx(udk.gaps(four_bar()).least.distance, rel=1e-12)
-    udk.save(four_bar((0.1, 0.012, 0.12)), scene)
-    assert udkjax("gaps", scene) == 1 and "overlap by" in capsys.readouterr().err
+    pins = {name: 1e3 * np.array(place) for name, place in FOUR_BAR.items()}
+    udk.save(four_bar((100.0, 12.0, 120.0), pins, units={"length": "mm"}), scene)
+    overlap = f"crank and rocker overlap by {-1e3 * udk.gaps(udk.load(scene)).least.distance:.6g} mm"
+    assert udkjax("gaps", scene) == 1 and overlap in capsys.readouterr().err
     assert udkjax("gaps", scene, "--layers") == 0 and "3 fewest layers" in capsys.readouterr().out

@@ -6,6 +6,7 @@ import pytest
 from scipy import stats
 
 import udkjax as udk
+from tests.command_line import udkjax
 from udkjax.synthesis.ranges.deviations import grade
 from udkjax.synthesis.ranges.second_order import quadratic
 
@@ -232,4 +233,42 @@ def test_what_varies_by_rounding_alone_has_no_shares():
     assert found.shares[angle]["number.r"].total == 0.0 and found.second_order.trusted[angle]
     assert found.shares[place]["number.r"].total == pytest.approx(1.0)
     row = next(line for line in str(found).splitlines() if angle in line)
-    assert row.split()[3] == "0" and row.endswith("none varies it") and "Not quadratic" not in str(found)
+    assert row.split()[4] == "0" and row.endswith("none varies it") and "Not quadratic" not in str(found)
+
+
+def test_numbers_are_read_and_printed_in_the_units_of_the_drawing(four_bar, tmp_path, capsys):
+    """A four-bar drawn in mm and degrees is the one in SI units: plain texts are in mm, and so is what is printed."""
+    pins = {"A": [0, 0], "B": [500, 866.0254037844386], "C": [2700.0, 1900.0], "D": [2500, 0]}
+    links = {name: {"pins": list(ends), "mass": 1} for name, ends in (("crank", "AB"), ("coupler", "BC"), ("rocker", "CD"))}
+    mech = udk.Drawing(pins=pins, links=links, ground=["A", "D"], units={"length": "mm", "angle": "deg"}).mechanism()
+    measures, drive = [SWING, "deviation(pin.C)"], {"drive": "body.crank.angle", "values": [0.0, 0.1, 0.2]}
+    given = {"length(crank)": ("2", 2e-3), "length(rocker)": ("+-3", 3e-3)}
+    limits = {SWING: ("40", np.radians(40)), measures[1]: ("1.5", 1.5e-3)}
+    texts, numbers = (
+        udk.tolerances(mech, *({k: x[n] for k, x in part.items()} for part in (given,)), measures, samples=2000,
+                       limits={k: x[n] for k, x in limits.items()}, **drive)
+        for n in (0, 1)
+    )  # fmt: skip
+    assert np.array_equal(texts.measured, numbers.measured) and texts.yield_ == numbers.yield_
+    swing, place = (line.split() for line in str(texts).splitlines()[2:4])
+    assert swing[:3] == [SWING, "deg", f"{np.degrees(texts.nominal[0]):.6g}"]
+    assert place[:2] == [measures[1], "mm"] and place[3] == f"{1e3 * texts.mean[measures[1]]:.6g}"
+    best = texts.cheapest(0.9)
+    assert f"length(crank)   {1e3 * best.deviations['length(crank)'][0]:.6g} mm" in str(best)
+    udk.save(mech, scene := tmp_path / "scene.toml")
+    tol, limit = (f"{name}=2" for name in ("length(crank)", measures[1]))
+    assert udkjax("tolerances", scene, "--driver", "body.crank.angle", "--tol", tol, "--measure", measures[1], "--limit", limit,
+                  "--samples", 500, "--cheapest", 0.9) == 0  # fmt: skip
+    out = capsys.readouterr().out
+    assert f"{measures[1]}  mm" in out and " mm\n" in out.split("cheapest")[1]
+
+
+def test_a_plain_text_is_refused_where_its_unit_is_ambiguous():
+    mech = udk.library.four_bar()
+    drawn = udk.Drawing(
+        pins={"A": [0, 0], "B": [10, 0], "C": [10, 10]}, links={"arm": {"pins": ["A", "B"], "mass": 1}}, ground=["A", "C"],
+        units={"length": "mm"}, springs={"s": {"between": ["C", "B"], "stiffness": "3 N/mm"}},
+    ).mechanism()  # fmt: skip
+    with pytest.raises(udk.SceneError, match="needs a unit, as length is in mm here"):
+        udk.tolerances(drawn, {"spring.s.stiffness": "5"}, {"f": lambda mech: mech.parameters()["spring.s.stiffness"]}, samples=9)
+    assert "rad" in str(udk.tolerances(mech, {"length(crank)": "0.001"}, [SWING], drive="body.crank.angle", samples=9))

@@ -44,7 +44,7 @@ class Count(NamedTuple):
         of other links are those of their bodies. Lengths are in the unit of the drawing, coordinates of slides from the drawn
         position.
         """
-        units, element = units_of_drawing(mechanism), element_of(mechanism, driver)
+        units, element = Units.of(mechanism.drawing), element_of(mechanism, driver)
         first, second = element.bodies
         if element.coordinate != "angle":
             return cls(0.0, units.size("m"), units.shown("m"), _words_of_length(mechanism, driver, element), units)
@@ -56,6 +56,14 @@ class Count(NamedTuple):
             return cls(0.0, size, "deg", f"the angle of {second}, from the drawn position", units)
         start, end, offset = link_line(mechanism.drawing, second)
         return cls(offset, size, "deg", f"the angle of {start}-{end} from the x axis", units)
+
+    @classmethod
+    def of_run(cls, mechanism: Mechanism, unit: str) -> "Count":
+        """Return the count of the times of a run (s), or of the values of an unknown driver (rad, m) over which it moves."""
+        units = Units.of(mechanism.drawing)
+        if unit == "rad":
+            return cls(0.0, math.pi / 180, "deg", "the angle of the driver", units)
+        return cls(0.0, units.size(unit), units.shown(unit), "time" if unit == "s" else "the way of the driver", units)
 
     @property
     def is_angle(self) -> bool:
@@ -130,11 +138,6 @@ def link_line(drawing: Drawing, link: str) -> tuple[str, str, float]:
     end = next(pin for pin in pins if pin != start)
     drawn, of_frame = places[end] - places[start], places[pins[1]] - places[pins[0]]
     return start, end, math.atan2(of_frame[0] * drawn[1] - of_frame[1] * drawn[0], of_frame @ drawn)
-
-
-def units_of_drawing(mechanism: Mechanism) -> Units:
-    """Return the units in which a mechanism was drawn; SI units and radians without a drawing."""
-    return Units(dict(mechanism.drawing.units) if isinstance(mechanism.drawing, Drawing) else None)
 
 
 def _words_of_length(mechanism: Mechanism, driver: str | Coordinate, element: Coordinate) -> str:

@@ -10,6 +10,7 @@ from jaxtyping import ArrayLike, Float
 from udkjax.annotations import NumberLike, Numbers
 from udkjax.argument_types import BY_NAME, HISTORY, NUMBERS_BY_NAME, ArgumentRequirement, of_kind
 from udkjax.arrays import is_traced, without_derivatives
+from udkjax.positions.answers.counting import Count
 from udkjax.positions.assembling.channels import StateHistory
 from udkjax.positions.following.drive import Drive, only_driver
 from udkjax.positions.gaps.derivatives import differentiable_gaps
@@ -17,7 +18,7 @@ from udkjax.positions.gaps.motion import motion_of_drive, motion_of_run
 from udkjax.positions.gaps.pairs import LinkPair, pairs_to_check
 from udkjax.positions.gaps.search import search
 from udkjax.positions.gaps.shapes import parts_of
-from udkjax.printing import PrintedTable, PrintsTable, fields_table, format_number, has_numbers, prints_table
+from udkjax.printing import PrintedTable, PrintsTable, fields_table, format_number, has_numbers, prints_table, units
 from udkjax.requirements import ArgumentError, ArgumentTypeError, GivenArguments, array, describe, require_finite
 from udkjax.scene.arguments import checked
 from udkjax.scene.elements.bodies import GROUND
@@ -67,6 +68,8 @@ class LeastGap(NamedTuple):
     bound: float
     points: Numbers
 
+    _units = units(distance="m", bound="m", points="m")
+
 
 @prints_table
 class Touch(NamedTuple):
@@ -91,33 +94,43 @@ class LeastGaps(PrintsTable):
         contacts: the stretches over which pairs touch, in the order of values.
         unit: of the values.
         missing: the share of the range that is not reached, or in which a run has failed: nothing is known there.
+        count: the zero and the units in which values and lengths are shown; None: SI units.
     """
 
     pairs: tuple[LeastGap, ...]
     contacts: tuple[Touch, ...] = eqx.field(static=True)
     unit: str = eqx.field(static=True, default="")
     missing: float = eqx.field(static=True, default=0.0)
+    count: Count | None = eqx.field(static=True, default=None)
 
     @property
     def least(self) -> LeastGap:
         """The smallest gap of all pairs."""
         return self.pairs[0]
 
+    def rows(self) -> list[tuple[str, str, str]]:
+        """Return the links of each pair, their least gap, and the value at which it is least, as texts in the drawing's units."""
+        size = max(float(np.max(np.abs(np.asarray(gap.points)))) for gap in self.pairs)
+        return [(" and ".join(x.pair), self._length(x.distance, size), self._value(x.value)) for x in self.pairs]
+
+    def remarks(self) -> list[str]:
+        """Return sentences, in the drawing's units, on where links touch and on how much of the range is not reached."""
+        says = [f"{' and '.join(x.pair)} touch from {self._value(x.begins)} to {self._value(x.ceases)}" for x in self.contacts]
+        return says + ([f"{100 * self.missing:.3g} % of the range is not reached"] if self.missing else [])
+
+    def _length(self, length: Any, scale: float) -> str:
+        size, unit = (1.0, "m") if self.count is None else (self.count.units.size("m"), self.count.units.shown("m"))
+        return format_number(length / size, unit, scale / size)
+
+    def _value(self, value: float) -> str:
+        return format_number(value, self.unit) if self.count is None else self.count.text(value)
+
     def _table(self) -> PrintedTable:
         if not has_numbers(self) or np.ndim(self.least.distance):
             return fields_table(self, {}, "gaps between links")
-        size = max(float(np.max(np.abs(np.asarray(gap.points)))) for gap in self.pairs)
-        rows = [
-            (" and ".join(gap.pair), format_number(gap.distance, "m", size), "at", format_number(gap.value, self.unit))
-            for gap in self.pairs
-        ]
-        says = [
-            f"{' and '.join(x.pair)} touch from {format_number(x.begins, self.unit)} to {format_number(x.ceases, self.unit)}"
-            for x in self.contacts
-        ]
-        if self.missing:
-            says.append(f"{100 * self.missing:.3g} % of the range is not reached")
-        return PrintedTable("least gaps between links", rows, remarks=says)
+        over = "" if self.count is None else f", by {self.count.words}"
+        rows = [(pair, gap, "at", value) for pair, gap, value in self.rows()]
+        return PrintedTable(f"least gaps between links{over}", rows, remarks=self.remarks())
 
 
 @checked
@@ -194,4 +207,5 @@ def gaps(
     ]
     order = np.argsort([x.distance for x in least], kind="stable")
     contacts.sort(key=lambda x: (x.begins, x.ceases))
-    return LeastGaps(tuple(found[k] for k in order), tuple(contacts), motion.unit, motion.missing)
+    count = Count.of_run(concrete, motion.unit) if run is not None else Count.of(concrete, driver_now)
+    return LeastGaps(tuple(found[k] for k in order), tuple(contacts), motion.unit, motion.missing, count)

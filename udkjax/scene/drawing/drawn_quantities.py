@@ -16,6 +16,7 @@ from udkjax.scene.elements.fields import vector_as_angle
 from udkjax.scene.elements.profiles import AbstractProfile, profile_class
 from udkjax.scene.numbers.formula import Measured, evaluate, is_computed, name_mistake, names_in
 from udkjax.scene.numbers.named_numbers import NamedNumber
+from udkjax.scene.numbers.sources import AbstractDrawing
 from udkjax.scene.numbers.units import FOLLOWS, QUANTITY, conversion_factor, dimension_of, field_unit, read_quantity, unit_sizes
 from udkjax.scene.tables.schema import CLASSES_BY_TYPE, keys, table_of, type_name
 from udkjax.wording import abbreviate, quote, suggestion
@@ -93,6 +94,25 @@ class Units:
         except ValueError as problem:
             problems.append(f"{path}: {problem}")
             return None
+
+    @classmethod
+    def of(cls, drawing: AbstractDrawing | None) -> "Units":
+        """Return the units in which a mechanism was drawn; SI units without a drawing."""
+        return cls(None if drawing is None else dict(drawing.units))
+
+    def read_text(self, text: str, unit: str) -> float:
+        """Return a number in an SI unit from a text with a unit, or without one, in the unit of the file.
+
+        Raises:
+            ValueError: it cannot be read, or its unit is missing, unknown or of another quantity.
+        """
+        try:
+            number = float(text)
+        except ValueError:
+            return read_quantity(text, unit)
+        found = self._plain(number, unit)
+        assert isinstance(found, float)
+        return found
 
     def read_numbers(self, table: object, problems: list[str]) -> dict[str, NamedNumber]:
         """Return the named numbers of a table: numbers, strings with a unit, expressions of others, or `NamedNumber`s."""

@@ -107,6 +107,7 @@ class AbstractDrawing(PrintsTable):
     def own_groups(self) -> Mapping[str, Mapping[str, eqx.Module]]:
         """The elements as the leaves of the drawing hold them: without the numbers that expressions give."""
 
+    units: eqx.AbstractVar[tuple[tuple[str, str], ...]]  # the units in which it was written, by quantity
     formulas: eqx.AbstractVar[tuple[Formula, ...]]
     massless: eqx.AbstractVar[tuple[str, ...]]  # the links for which no mass is given
 

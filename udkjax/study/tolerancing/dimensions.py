@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from udkjax.positions.assembling.channels import has_point
+from udkjax.scene.drawing.drawn_quantities import Units
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.tables.checks import SceneError
 from udkjax.study.identify.problem.parameters import Parameter, unknowns_of
@@ -65,6 +66,7 @@ class ToleratedNumbers:
     def __init__(self, mechanism: Mechanism, given: Mapping[str, ToleranceLike]):
         self.mechanism, problems = mechanism, []
         self.names: list[str] = []
+        self.units: list[str] = []
         self.targets: list[Target] = []
         self.sources: list[DeviationSource] = []
         rows: list[tuple[float, float, float, int]] = []  # nominal value, middle, standard deviation, source
@@ -147,10 +149,11 @@ class ToleratedNumbers:
             raise ValueError("is prescribed by a driver, and has no tolerance: sweep it instead")
         rows = []
         for entry, units, target, nominal in zip(unknowns.names, unknowns.units, unknowns.targets, unknowns.guess, strict=True):
-            tolerance = read_tolerance(given, units, float(nominal))
+            tolerance = read_tolerance(given, units, float(nominal), Units.of(self.mechanism.drawing))
             known = DeviationSource(tolerance.shared or entry, tolerance)
             rows.append((float(nominal), *tolerance.middle_and_deviation(units), self._source(known)))
             self.names.append(entry)
+            self.units.append(units)
             self.targets.append(target)
         return rows
 
@@ -166,5 +169,6 @@ class ToleratedNumbers:
             self.sources.append(DeviationSource(entry, Tolerance(size, "m"), True))
             rows.append((0.0, 0.0, size, len(self.sources) - 1))
             self.names.append(entry)
+            self.units.append("m")
             self.targets.append(Target(function=_Play(joint, axis)))
         return rows

@@ -14,8 +14,8 @@ from udkjax.printing import PrintedTable, prints_table
 from udkjax.progress import ProgressOption, report_progress
 from udkjax.requirements import concrete_only
 from udkjax.scene.arguments import checked
+from udkjax.scene.drawing.drawn_quantities import Units
 from udkjax.scene.mechanism import Mechanism
-from udkjax.scene.numbers.units import read_quantity
 from udkjax.scene.tables.checks import SceneError
 from udkjax.study.tolerancing.cheapest import Limits, common_factor, optimal_scales
 from udkjax.study.tolerancing.dimensions import ToleratedNumbers
@@ -46,6 +46,7 @@ class Share(NamedTuple):
     total: float
 
 
+@prints_table
 class CheapestTolerances(NamedTuple):
     """The tolerances of least cost with a yield."""
 
@@ -54,6 +55,11 @@ class CheapestTolerances(NamedTuple):
     cost: float  # relative to that of the given tolerances
     yield_: float  # of samples that the search did not use
     standard_error: float
+    texts: dict[str, tuple[str, str]]  # the deviations in the units of the drawing
+
+    def _table(self) -> PrintedTable:
+        title = f"cheapest tolerances with a yield of {100 * self.yield_:.4g} %: {self.cost:.3g} times the cost"
+        return PrintedTable(title, [(name, *ends) for name, ends in self.texts.items()], ("number", "lower", "upper deviation"))
 
 
 @prints_table
@@ -86,6 +92,12 @@ class ToleranceAnalysis:
         self.not_assembled = float(1.0 - reached.mean())
         self.outside = {self.names[k]: float(1.0 - x) for k, x in zip(limits.which, holds.mean(0), strict=True)}
         self._reached = measured[reached]
+        self._drawn = Units.of(numbers.mechanism.drawing)
+
+    def shown(self, name: str) -> tuple[str, float]:
+        """Return the unit in which the drawing shows a measure, empty for functions, and its size in the SI unit."""
+        unit = self._measuring.units[name]
+        return (self._drawn.shown(unit), self._drawn.size(unit)) if unit else ("", 1.0)
 
     def limits_of(self, name: str) -> list[float]:
         """Return the finite limits of a measure."""
@@ -165,8 +177,13 @@ class ToleranceAnalysis:
         numbers = self._numbers
         half = numbers.sizes * scales[numbers.owners] / np.array([numbers.sources[k].tolerance.spread for k in numbers.owners])
         deviations = {n: (float(c - h), float(c + h)) for n, c, h in zip(numbers.names, numbers.middle, half, strict=True)}
+        texts = {
+            name: (self._drawn.text(low, unit), self._drawn.text(high, unit))
+            for (name, (low, high)), unit in zip(deviations.items(), numbers.units, strict=True)
+        }
         factors = dict(zip(names, map(float, scales), strict=True))
-        return CheapestTolerances(deviations, factors, float((weights / scales).sum() / weights.sum()), found, error)
+        cost = float((weights / scales).sum() / weights.sum())
+        return CheapestTolerances(deviations, factors, cost, found, error, texts)
 
     def _yield(self, u: np.ndarray, scales: np.ndarray) -> tuple[float, float]:
         measured = self._measuring(self._numbers.values(u, scales))
@@ -194,9 +211,11 @@ class ToleranceAnalysis:
             outside = f"{100 * self.outside[name]:.3g} %" if name in self.outside else "no limit"
             place = self.names.index(name)
             deviation = 0.0 if self._is_constant[place] else self.standard_deviation[name]
-            rows.append((name, f"{self.nominal[place]:.6g}", f"{self.mean[name]:.6g}", f"{deviation:.3g}",
-                         f"{low[name][0]:.6g}", f"{low[name][1]:.6g}", outside, shares or "none varies it"))  # fmt: skip
-        heads = "measure", "nominal", "mean", "standard deviation", "0.1 %", "99.9 %", "outside", "share of the variance"
+            unit, size = self.shown(name)
+            nominal, mean, least, most = (f"{x / size:.6g}" for x in (self.nominal[place], self.mean[name], *low[name]))
+            spread = f"{deviation / size:.3g}"
+            rows.append((name, unit, nominal, mean, spread, least, most, outside, shares or "none varies it"))
+        heads = "measure", "unit", "nominal", "mean", "standard deviation", "0.1 %", "99.9 %", "outside", "share of the variance"
         remarks = []
         if self.not_assembled:
             remarks.append(f"{100 * self.not_assembled:.3g} % of the samples do not reach all values of the drive.")
@@ -232,9 +251,9 @@ def tolerances(
     Args:
         mechanism: the mechanism, with its nominal numbers.
         tolerances: the largest deviation by the name of a number (`pin.B`, `length(crank)`, `spring.s.stiffness`): in SI units,
-            as a text ("0.05 mm"), as a grade of ISO 286 of a length ("h9", "H7", "js8"; "IT9" is js9), or as a `Tolerance`. A
-            `PinClearance` by the name of a joint is the play of its pin. Deviations are independent, and a plain tolerance is
-            three standard deviations of a normal distribution.
+            as a text ("0.05 mm", or "0.05" in the unit of the drawing), as a grade of ISO 286 of a length ("h9", "H7", "js8";
+            "IT9" is js9), or as a `Tolerance`. A `PinClearance` by the name of a joint is the play of its pin. Deviations are
+            independent, and a plain tolerance is three standard deviations of a normal distribution.
         measures: texts, or measures by name. A text such as "range(body.rocker.angle)" is max, min, range, mean, rms, first or
             last of a coordinate (`body.NAME.angle`, `pin.NAME.x`, as for `kinematics`) over the drive, in rad and m;
             "deviation(pin.P)" is the largest distance from the positions of the nominal mechanism. A goal, such as `PathGoal`
@@ -242,7 +261,8 @@ def tolerances(
             returns a number, for example from `simulate`.
         drive: the driver or coordinate, as for `kinematics`; by default the only driver. Functions do not need it.
         values: values of the driver; by default every 5 degrees of a turn from the drawn position.
-        limits: the largest value of a measure by name, or (least, largest), in SI units or as texts ("0.5 mm", "2 deg").
+        limits: the largest value of a measure by name, or (least, largest), in SI units or as texts ("0.5 mm", "2 deg",
+            or "0.5" in the unit of the drawing).
         samples: the number N of samples.
         seed: the seed of the random deviations.
         progress: None shows a line after two seconds, False none; or a function of a `Progress`.
@@ -271,13 +291,13 @@ def tolerances(
 
 
 def _limits(mechanism: Mechanism, measuring: Measuring, given: Mapping[str, Any]) -> Limits:
-    problems, which, low, high = [], [], [], []
+    problems, which, low, high, units = [], [], [], [], Units.of(mechanism.drawing)
     for name, limit in given.items():
         if name not in measuring.names:
             problems.append(f"limits: no measure {quote(name)}{suggestion(name, measuring.names)}")
             continue
         try:
-            parts = [_number(x, measuring.units[name]) for x in (limit if isinstance(limit, list | tuple) else [limit])]
+            parts = [_number(x, measuring.units[name], units) for x in (limit if isinstance(limit, list | tuple) else [limit])]
             if len(parts) > 2 or not parts or np.isnan(parts).any() or (len(parts) == 2 and parts[0] >= parts[1]):
                 raise ValueError(f"give the largest value, or the least and a larger one, not {limit}")
         except (TypeError, ValueError) as problem:
@@ -291,8 +311,8 @@ def _limits(mechanism: Mechanism, measuring: Measuring, given: Mapping[str, Any]
     return Limits(np.array(which, int), np.array(low), np.array(high))
 
 
-def _number(given: Any, unit: str) -> float:
-    return read_quantity(given, unit) if isinstance(given, str) else float(given)
+def _number(given: Any, unit: str, units: Units) -> float:
+    return units.read_text(given, unit) if isinstance(given, str) else float(given)
 
 
 def _share(holds: np.ndarray) -> tuple[float, float]:

@@ -8,6 +8,7 @@ from jaxtyping import Float
 from scipy.special import ndtr, ndtri
 
 from udkjax.requirements import require_choice, require_number, require_numbers, require_text
+from udkjax.scene.drawing.drawn_quantities import Units
 from udkjax.scene.numbers.units import conversion_factor, read_quantity
 from udkjax.wording import quote
 
@@ -148,13 +149,14 @@ def grade(text: str, length: float) -> Tolerance | None:
     return Tolerance((low * width, high * width), "m")
 
 
-def read_tolerance(given: Any, units: str, nominal: float) -> Tolerance:
+def read_tolerance(given: Any, units: str, nominal: float, drawn: Units) -> Tolerance:
     """Return the tolerance of a number from a number, a text such as "0.05 mm" or "h9", or a `Tolerance`.
 
     Args:
         given: the tolerance.
         units: the SI unit of the number.
         nominal: its nominal value.
+        drawn: the units of the drawing, for texts without a unit.
 
     Raises:
         ValueError: the text cannot be read, or is a grade of another quantity than a length.
@@ -168,7 +170,7 @@ def read_tolerance(given: Any, units: str, nominal: float) -> Tolerance:
         if units != "m" and grade(given.strip(), 0.1) is not None:
             raise ValueError(f"{quote(given)} is a grade of a length; this number is measured in {units or 'no unit'}")
         text = given.strip().removeprefix("+-").removeprefix("±")
-        return Tolerance(read_quantity(text, units), units)
+        return Tolerance(drawn.read_text(text, units), units)
     if isinstance(given, bool) or np.ndim(given) or not np.isreal(given):
         raise TypeError('must be a number, a text such as "0.05 mm" or "h9", a Tolerance or a PinClearance')
     return Tolerance(float(given), units)
