@@ -109,7 +109,9 @@ def by_bfgs(curve: np.ndarray, seconds: float, bars: int, seed: int) -> Result:
     one_by_one = CurveSearch(wanted, curve_limits(wanted, None, TRANSMISSION), bars, seed)
     begun, best, dyads = time.process_time(), np.inf, (bars - 2) // 2
     starts, topology = find_starts(wanted, one_by_one.limits, dyads, STARTS, STARTS, np.random.default_rng(seed))
-    low, high = one_by_one.limits.bounds(dyads, wanted.is_whole)
+    low, high = (
+        bound[0] for bound in one_by_one.limits.bounds(topology, wanted.is_whole)
+    )  # the same for all: all joints are pins
 
     def loss(y: np.ndarray, topology: Topology, task: Task, blur: float) -> tuple[float, np.ndarray]:
         value, _, _, _, slope = evaluate(np.clip(y, low, high)[None], topology, task, blur)

@@ -4,6 +4,7 @@ import numpy as np
 import svgelements
 
 from udkjax.synthesis.curves.curve_file import FRACTIONS
+from udkjax.synthesis.curves.dyad_forms import PINS
 from udkjax.synthesis.curves.dyads import BASE, EACH, HEAD, SECOND, Topology, number_count, positions
 
 LETTERS = {
@@ -81,7 +82,12 @@ def curves_of_mechanisms(count: int, rng: np.random.Generator) -> list[np.ndarra
             x[0, k + 4 : k + 6] = rng.uniform(0.7, 3.0, 2)
         first = np.array([[1, *(links[1:] - rng.integers(1, 3, dyads - 1))]])
         second = np.where(rng.random((1, dyads)) < 0.5, 0, np.maximum(first - 2, 0) * (first > BASE + 1))
-        at = positions(x, Topology(first, second, rng.choice([-1.0, 1.0], (1, dyads)), np.zeros(1, int)), theta, 0.0)
+        at = positions(
+            x,
+            Topology(first, second, rng.choice([-1.0, 1.0], (1, dyads)), np.full((1, dyads), PINS), np.zeros(1, int)),
+            theta,
+            0.0,
+        )
         if np.abs(at.cosines).max() < np.cos(np.deg2rad(10.0)) and np.ptp(np.real(at.pin)) > 0.1:
             curves.append(_points(at.pin[0, :-1]))
     return curves

@@ -6,6 +6,7 @@ import pytest
 import udkjax as udk
 from udkjax.synthesis.curves.curve_search import CurveSearch, OutOfTimeError
 from udkjax.synthesis.curves.descent import LinkageLimits
+from udkjax.synthesis.curves.dyad_forms import PINS, RAIL, SLIDE
 from udkjax.synthesis.curves.dyads import BASE, EACH, HEAD, SPAN, Topology, gradients, number_count, positions
 from udkjax.synthesis.curves.linkage_drawing import drawing_of, turns_on_its_branch
 from udkjax.synthesis.curves.random_linkages import random_linkages, turn_angles
@@ -15,8 +16,10 @@ ELLIPSE = np.array([[3.0 + 0.2 * np.cos(t), 1.0 + 0.1 * np.sin(t)] for t in np.l
 
 
 @pytest.mark.parametrize("geared", [False, True])
-def test_derivatives_of_linkages_are_those_of_their_positions(geared):
-    x, topology = random_linkages(12, 3, np.random.default_rng(0), geared)
+@pytest.mark.parametrize("slides", [0.0, 0.7])
+def test_derivatives_of_linkages_are_those_of_their_positions(geared, slides):
+    x, topology = random_linkages(24, 3, np.random.default_rng(0), geared, slides)
+    assert set(np.unique(topology.form)) == ({PINS, RAIL, SLIDE} if slides else {PINS})
     share = np.arange(20) / 20
     x[:, SPAN] = 5.0
 
@@ -38,15 +41,37 @@ def test_derivatives_of_linkages_are_those_of_their_positions(geared):
 
 
 @pytest.mark.parametrize("geared", [False, True])
-def test_random_linkages_close_over_the_whole_turn(geared):
-    x, topology = random_linkages(200, 3, np.random.default_rng(1), geared)
-    assert np.abs(positions(x, topology, turn_angles(200)).cosines).max() < 1.0
+@pytest.mark.parametrize("slides", [0.0, 0.7])
+def test_random_linkages_close_over_the_whole_turn_with_their_dimensions(geared, slides):
+    x, topology = random_linkages(200, 3, np.random.default_rng(1), geared, slides)
+    cosines = np.abs(positions(x, topology, turn_angles(200)).cosines).max(2)
+    assert cosines[topology.form.T != SLIDE].max() < 1.0  # a slide may pass too near to its link's pin to be used
+    usable = (cosines < 0.99).all(0)
+    x, topology = x[usable], topology.take(usable)
+    at, rows = positions(x, topology, turn_angles(len(x)), least=0.0), np.arange(len(x))
+    assert len(x) > 50
+    for d in range(3):
+        numbers = x[:, HEAD + EACH * d : HEAD + EACH * (d + 1), None]
+        own, other, B, R = at.turns[BASE + 2 * d], at.turns[BASE + 2 * d + 1], topology.second[:, d], at.ends[d]
+        Q = at.origins[B, rows] + at.turns[B, rows] * (numbers[:, 2] + 1j * numbers[:, 3])
+        on_first, on_second = np.conj(own) * (R - at.origins[BASE + 2 * d]), np.conj(other) * (R - Q)
+        pins, rails, sliding = (topology.form[:, d] == form for form in (PINS, RAIL, SLIDE))
+        for which, found, expected in (
+            (~sliding, on_first, numbers[:, 4]),
+            (pins, on_second, numbers[:, 5]),
+            (rails, on_second.imag, 0.0 * numbers[:, 4]),
+            (rails, other / at.turns[B, rows], np.exp(1j * numbers[:, 5])),
+            (sliding, on_first, 1j * numbers[:, 4]),
+            (sliding, on_second.imag, 0.0 * numbers[:, 4]),
+            (sliding, other / own, 1.0 + 0.0 * numbers[:, 4]),
+        ):
+            np.testing.assert_allclose(found[which], np.broadcast_to(expected, found.shape)[which], rtol=1e-9, atol=1e-9)
 
 
 def test_a_four_bar_has_the_positions_of_the_drawing():
     x = np.zeros((1, number_count(1)))
     x[0, HEAD : HEAD + EACH], x[0, -2:] = [1.0, 0.0, 3.0, 0.0, 2.5, 2.0], [1.0, 0.5]
-    topology = Topology(np.array([[1]]), np.array([[0]]), np.array([[1.0]]), np.array([0]))
+    topology = Topology(np.array([[1]]), np.array([[0]]), np.array([[1.0]]), np.array([[PINS]]), np.array([0]))
     at = positions(x, topology, np.array([[0.0, 1.0]]))
     P, R, Q = at.origins[BASE, 0], at.ends[0, 0], at.origins[BASE + 1, 0]
     np.testing.assert_allclose(np.abs(R - P), 2.5, rtol=1e-12)
@@ -54,11 +79,11 @@ def test_a_four_bar_has_the_positions_of_the_drawing():
     np.testing.assert_allclose(P, np.exp(1j * np.array([0.0, 1.0])), rtol=1e-12)
 
 
-def test_a_linkage_with_two_cranks_is_the_mechanism_of_its_drawing():
+def test_a_linkage_with_two_cranks_and_slides_is_the_mechanism_of_its_drawing():
     wanted = WantedCurve(ELLIPSE)
-    x, topology = random_linkages(100, 2, np.random.default_rng(2), geared=True)
-    for ratio in (3, -5):
-        k = np.flatnonzero(topology.ratio == ratio)[:1]
+    x, topology = random_linkages(300, 2, np.random.default_rng(2), geared=True, slides=0.7)
+    for ratio, forms in ((3, (PINS, PINS)), (-5, (RAIL, SLIDE)), (2, (SLIDE, RAIL))):
+        k = np.flatnonzero((topology.ratio == ratio) & (topology.form == forms).all(1))[:1]
         one = topology.take(k)
         mechanism = drawing_of(x[k[0]], one, wanted, "geared").mechanism()
         assert turns_on_its_branch(mechanism, x[k[0]], one, wanted, 10.0 * wanted.extent)
@@ -193,3 +218,17 @@ def test_a_search_ends_in_the_middle_of_a_stage():
     search.until = np.inf
     search.finish(0.0)
     assert 0.0 < search.best < 0.1 and set(search.found) == {4}
+
+
+def test_the_curve_of_a_slider_crank_is_drawn_with_a_slide(tmp_path):
+    A = np.exp(1j * np.linspace(0.0, 2.0 * np.pi, 120))
+    slider = A.real + np.sqrt(9.0 - (A.imag - 0.3) ** 2) + 0.3j
+    curve = as_points(A + (slider - A) * (0.5 + 0.3j))
+    found = udk.mechanisms_for(curve, bars=4, slides=True, geared=False, seconds=600, rounds=1, results=9, progress=False)
+    best = min(found, key=lambda one: one.error)
+    assert best.error < 0.002 and best.bars == 4 and best.drawing.groups["slide"]
+    udk.save(best.mechanism, tmp_path / "slider.toml")
+    mechanism = udk.load(tmp_path / "slider.toml")
+    motion = udk.kinematics(mechanism, None, np.linspace(0.0, 1.0, 721))
+    assert np.asarray(motion.reached).all() and np.abs(udk.violation(mechanism, motion)).max() < 1e-12 * best.size
+    assert chamfer(np.asarray(udk.path(mechanism, motion, "P")), best.curve) < 0.01 * WantedCurve(curve).extent

@@ -30,6 +30,7 @@ def design(
     size: float | None = None,
     seconds: float = 60.0,
     geared: bool = True,
+    slides: bool = False,
     unit: str = "mm",
     json: Json = False,
 ) -> None:
@@ -55,13 +56,14 @@ def design(
         size: for a curve, the largest distance of any pin from its middle, in its unit; by default three times its extent.
         seconds: CPU time after which the search for a curve ends (s).
         geared: whether mechanisms for a curve may have a second crank, joined to the first by a belt.
+        slides: whether a third of their dyads has a slide or a rail in the place of a pin.
         unit: unit of the curve and of the drawings.
     """
     for name, value, minimum in (("starts", starts, 1), ("results", results, 1), ("seed", seed, 0)):
         if value < minimum:
             refuse(f"--{name} {value}: must be at least {minimum}")
     if goal is None and curve is not None:
-        given = {"bars": bars, "seed": seed, "results": results, "seconds": seconds, "geared": geared}
+        given = {"bars": bars, "seed": seed, "results": results, "seconds": seconds, "geared": geared, "slides": slides}
         _show_curve(curve, given, size, unit, out, json)
         return
     if goal is None or curve is not None:

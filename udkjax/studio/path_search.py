@@ -26,7 +26,8 @@ def find_mechanisms(path: object, unit: str = "mm", seed: int = 0) -> JsonObject
     Args:
         path: places [x, y] of the path (m), in order; it is closed if its ends nearly meet.
         unit: unit of lengths of the drawings.
-        seed: number of the search; each finds other mechanisms, up to the fourth with more bars and more time.
+        seed: number of the search; each finds other mechanisms, up to the fourth with more bars and more time. Every second one
+            has slides.
 
     Returns:
         `designs`, the best first, each with its `document`, `text`, the largest `deviation` of the path (m), whether the crank
@@ -42,7 +43,7 @@ def find_mechanisms(path: object, unit: str = "mm", seed: int = 0) -> JsonObject
     bars, seconds = EFFORTS[min(seed, len(EFFORTS) - 1)]
     given: dict[str, Any] = {"bars": bars, "seconds": seconds, "seed": seed, "results": RESULTS, "unit": unit}
     try:
-        found = mechanisms_for(points, transmission=TRANSMISSION, progress=False, **given)
+        found = mechanisms_for(points, transmission=TRANSMISSION, slides=seed % 2 == 1, progress=False, **given)
     except ValueError as problem:
         raise RefusedError(400, f"path: {problem}") from None
     designs = [_drawn(design, points) for design in found]

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from udkjax.synthesis.curves.dyads import TINY
+from udkjax.synthesis.curves.dyad_forms import TINY
 from udkjax.synthesis.curves.targets import CurveTarget
 
 ALONG = 0.02  # weight of tangential moves within neighbours, relative to normal ones: it keeps points from sliding for nothing

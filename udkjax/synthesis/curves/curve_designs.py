@@ -27,7 +27,8 @@ class CurveDesign(FoundMechanism):
         curve: the drawn curve (m, 2) (m).
         bars: number of links, with the ground.
         size: largest distance (m) of any pin from the middle of the curve over the whole turn.
-        transmission: smallest angle (rad) between the two links of a dyad, or between one and the other prolonged.
+        transmission: smallest angle (rad) between the two links of a dyad, or between one and the other prolonged; at a slide,
+            between a link and its rail, or its line and the perpendicular through the pins of the dyad.
         values: values of the driver (rad) at the ends of the curve.
         turns: True: `kinematics` follows the mechanism over 720 positions of a whole turn, on one branch.
         driver: the driver.
@@ -123,7 +124,7 @@ def ranked(found: dict[int, list[FoundLinkage]], wanted: WantedCurve, count: int
     chosen: list[CurveDesign] = []
     errors: list[tuple[bytes, float]] = []
     for one in every:
-        structure = one.topology.first.tobytes() + one.topology.second.tobytes() + one.topology.ratio.tobytes()
+        structure = b"".join(a.tobytes() for a in one.topology if a is not one.topology.side)
         if len(chosen) == count or any(s == structure and abs(e - one.error) < 0.02 * e for s, e in errors):
             continue
         design = confirmed(one, wanted, f"curve {len(chosen) + 1}", unit)

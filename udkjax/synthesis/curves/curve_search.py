@@ -98,11 +98,14 @@ class CurveSearch:
         bars: the largest number of links, with the ground.
         seed: seed of all random numbers.
         geared: whether every second round begins with two geared cranks, if there are enough bars.
+        slides: fraction of random dyads that have a slide.
     """
 
-    def __init__(self, wanted: WantedCurve, limits: LinkageLimits, bars: int, seed: int, geared: bool = True):
+    def __init__(
+        self, wanted: WantedCurve, limits: LinkageLimits, bars: int, seed: int, geared: bool = True, slides: float = 0.0
+    ):
         self.wanted, self.limits, self.bars = wanted, limits, bars
-        self.geared = geared and bars > FEWEST_BARS
+        self.geared, self.slides = geared and bars > FEWEST_BARS, slides
         self.seed, self.families, self.candidates = seed, 0, 0
         inner = limits._replace(cosine=limits.cosine - 2 * SLACK, size=limits.size * (1.0 - 2 * SLACK))
         self.coarse = Task(wanted.target(96), sampling(64, 32, wanted.is_whole), inner)
@@ -161,7 +164,7 @@ class CurveSearch:
 
     def _start(self, beams: dict[int, Kept], bars: int, rng: np.random.Generator) -> None:
         dyads, geared = divmod(bars - 2, 2)
-        x, topology = find_starts(self.wanted, self.limits, dyads, SAMPLES, 2 * OF_STARTS[0][3], rng, bool(geared))
+        x, topology = find_starts(self.wanted, self.limits, dyads, SAMPLES, 2 * OF_STARTS[0][3], rng, bool(geared), self.slides)
         family = self.families + np.arange(len(x))
         self.families += len(x)
         if len(x):
@@ -171,7 +174,9 @@ class CurveSearch:
         if bars not in beams or not len(beams[bars].x):
             return
         parents = beams[bars]
-        x, topology = grown((parents.x, parents.topology), self.coarse.target, self.coarse.sample, TRIES, CHILDREN, rng)
+        x, topology = grown(
+            (parents.x, parents.topology), self.coarse.target, self.coarse.sample, TRIES, CHILDREN, rng, self.slides
+        )
         children = Kept(x, topology, np.zeros(len(x)), np.repeat(parents.family, CHILDREN))
         self._keep(beams, bars + 2, self._improve(children, OF_GROWTH))
 
@@ -253,5 +258,5 @@ def without_idle_dyads(x: np.ndarray, topology: Topology) -> tuple[np.ndarray, T
     parts = [x[:HEAD], *(x[HEAD + EACH * d : HEAD + EACH * (d + 1)] for d in dyads), x[-TAIL:]]
     first, second = number[topology.first[:, dyads]], number[topology.second[:, dyads]]
     ratio = topology.ratio * ((first == GEARED) | (second == GEARED)).any()
-    chosen = Topology(first, second, topology.side[:, dyads], ratio)
+    chosen = Topology(first, second, topology.side[:, dyads], topology.form[:, dyads], ratio)
     return np.concatenate(parts), chosen

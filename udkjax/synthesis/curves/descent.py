@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from udkjax.synthesis.curves.comparison import compare
+from udkjax.synthesis.curves.dyad_forms import RAIL, SLIDE
 from udkjax.synthesis.curves.dyads import (
     BASE,
     EACH,
@@ -43,14 +44,17 @@ class LinkageLimits(NamedTuple):
     shortest: float
     weight: float = 1.0
 
-    def bounds(self, dyads: int, is_whole: bool) -> tuple[np.ndarray, np.ndarray]:
-        """Return the lower and upper bounds of the numbers of a linkage."""
-        high = np.full(number_count(dyads), REACH)
+    def bounds(self, topology: Topology, is_whole: bool) -> tuple[np.ndarray, np.ndarray]:
+        """Return the lower and upper bounds (K, numbers) of the numbers of linkages."""
+        high = np.full((len(topology.form), number_count(topology.dyads)), REACH)
         low = -high
-        low[PHASE], high[PHASE] = -np.inf, np.inf
-        low[SPAN], high[SPAN] = FULL_TURN if is_whole else LEAST_SPAN, FULL_TURN
-        for d in range(dyads):
-            low[HEAD + EACH * d + 4 : HEAD + EACH * d + 6] = self.shortest
+        low[:, PHASE], high[:, PHASE] = -np.inf, np.inf
+        low[:, SPAN], high[:, SPAN] = FULL_TURN if is_whole else LEAST_SPAN, FULL_TURN
+        for d in range(topology.dyads):
+            k, form = HEAD + EACH * d + 4, topology.form[:, d]
+            low[:, k] = np.where(form == SLIDE, -REACH, self.shortest)
+            low[:, k + 1] = np.where(form == RAIL, -np.inf, self.shortest)
+            high[form == RAIL, k + 1] = np.inf
         return low, high
 
 
@@ -150,7 +154,7 @@ def descend(x: np.ndarray, topology: Topology, task: Task, blur: float, steps: i
         blur: distance (RMS radii) below which squares are minimized.
         steps: number of steps.
     """
-    low, high = task.limits.bounds(topology.dyads, task.sample.is_whole)
+    low, high = task.limits.bounds(topology, task.sample.is_whole)
     x = np.clip(x, low, high)
     now = list(evaluate(x, topology, task, blur))
     damping, places = np.full(len(x), 1e-2), np.arange(x.shape[1])

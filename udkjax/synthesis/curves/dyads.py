@@ -1,11 +1,11 @@
-"""Linkages of dyads in lanes: every position by an intersection of circles, derivatives by statics.
+"""Linkages of dyads in lanes: every position by an intersection of circles or lines, derivatives by statics.
 
 Link 0 is the ground, link 1 the crank, link 2 a second crank that turns `ratio` times as fast, by a belt. Dyad d adds the links
-3 + 2 d, from its joint P on one link to its joint R, and 4 + 2 d, from its joint Q on another link to R. The drawing pin is a
-point of the last dyad's first link. The frame of a link has its origin at O, P or Q, and its x axis points to R.
+3 + 2 d, with its joint P on one link, and 4 + 2 d, with its joint Q on another one; `dyad_forms` says how these two are joined.
+The drawing pin is a point of the last dyad's first link. The frame of a crank has its origin at its pivot.
 
 The numbers x of a linkage are: the place of O (2), the part of the turn that draws the curve (rad), the pivot of the second crank
-(2) and its angle at the beginning (rad), for each dyad the places of P and Q on their links (4) and the lengths P-R and Q-R (2),
+(2) and its angle at the beginning (rad), for each dyad the places of P and Q on their links (4) and the two numbers of its form,
 and the place of the drawing pin on its link (2). Places are complex numbers.
 """
 
@@ -13,11 +13,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from udkjax.synthesis.curves.dyad_forms import SLIDE, Dyads, balance, cross, dot, lanes_of_forms, place
+
 BASE = 3  # links without dyads
 HEAD, EACH, TAIL = 6, 6, 2  # numbers before the dyads, of each dyad, and after them
 SPAN, SECOND, PHASE = 2, 3, 5  # indices of the part of the turn, and of the second crank's pivot and angle
 GEARED = 2  # number of the second crank
-TINY = 1e-30  # squared length (RMS radii), far below rounding: keeps divisions finite where two points coincide
 
 
 class Topology(NamedTuple):
@@ -27,12 +28,14 @@ class Topology(NamedTuple):
         first: number of the link that carries P (K, D).
         second: number of the link that carries Q (K, D).
         side: 1 or -1, the side of P-Q on which R is (K, D).
+        form: PINS, RAIL or SLIDE of `dyad_forms` (K, D).
         ratio: turns of the second crank for one of the crank, a whole number; 0 if there is none (K,).
     """
 
     first: np.ndarray
     second: np.ndarray
     side: np.ndarray
+    form: np.ndarray
     ratio: np.ndarray
 
     def take(self, which: Any) -> "Topology":
@@ -86,28 +89,16 @@ def positions(x: np.ndarray, topology: Topology, theta: np.ndarray, least: float
     for d in range(D):
         k = HEAD + EACH * d
         A, B = topology.first[:, d], topology.second[:, d]
-        r1, r2 = x[:, k + 4, None], x[:, k + 5, None]
         P = z[A, lanes] + u[A, lanes] * _complex(x, k)
         Q = z[B, lanes] + u[B, lanes] * _complex(x, k + 2)
-        way = Q - P
-        square = np.real(way) ** 2 + np.imag(way) ** 2 + TINY
-        cosine = (r1 * r1 + r2 * r2 - square) / (2.0 * r1 * r2)
-        sine = np.sqrt(np.maximum(1.0 - cosine * cosine, least * least))
-        across = (topology.side[:, d, None] * r1 * r2) * sine / square
-        R = P + way * (0.5 + 0.5 * (r1 * r1 - r2 * r2) / square + 1j * across)
-        z[BASE + 2 * d], z[BASE + 2 * d + 1] = P, Q
-        u[BASE + 2 * d], u[BASE + 2 * d + 1] = (R - P) / r1, (R - Q) / r2
-        ends[d], cosines[d] = R, cosine
+        z[BASE + 2 * d] = P
+        one, two, side = x[:, k + 4, None], x[:, k + 5, None], topology.side[:, d, None]
+        for form, w in lanes_of_forms(topology.form[:, d]):
+            at, z[BASE + 2 * d + 1, w] = place(form, P[w], Q[w], u[B, lanes][w], one[w], two[w], side[w], least)
+            u[BASE + 2 * d, w], u[BASE + 2 * d + 1, w] = at.turn1, at.turn2
+            ends[d, w], cosines[d, w] = at.R, at.cosine
     last = BASE + 2 * D - 2
     return DyadPositions(z, u, ends, cosines, z[last] + u[last] * _complex(x, x.shape[1] - TAIL))
-
-
-def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return np.real(a) * np.real(b) + np.imag(a) * np.imag(b)
-
-
-def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return np.real(a) * np.imag(b) - np.imag(a) * np.real(b)
 
 
 def gradients(
@@ -139,40 +130,34 @@ def gradients(
     force, moment = np.zeros((L, K, 3, T), complex), np.zeros((L, K, 3, T))
     result = np.zeros((K, x.shape[1], 3, T))
 
-    def load(link: np.ndarray | int, point: np.ndarray, f: np.ndarray, k: int) -> None:
-        which = (link, lanes) if isinstance(link, np.ndarray) else link
+    def load(link: np.ndarray | int, w: Any, point: np.ndarray, f: np.ndarray, k: int) -> None:
+        which = (link, lanes[w])
         arm, local = (point - z[which])[:, None], np.conj(f) * u[which][:, None]
         force[which] += f
-        moment[which] += _cross(arm, f)
-        result[:, k] += np.real(local)
-        result[:, k + 1] -= np.imag(local)
+        moment[which] += cross(arm, f)
+        result[w, k] += np.real(local)
+        result[w, k + 1] -= np.imag(local)
 
-    unit = np.zeros((K, 3, T), complex)
+    unit, every = np.zeros((K, 3, T), complex), slice(None)
     unit[:, 0], unit[:, 1] = 1.0, 1j
-    load(L - 2, at.pin, unit, x.shape[1] - TAIL)
+    load(L - 2, every, at.pin, unit, x.shape[1] - TAIL)
     for d in range(D - 1, -1, -1):
-        k, one, two = HEAD + EACH * d, BASE + 2 * d, BASE + 2 * d + 1
-        r1, r2 = x[:, k + 4, None], x[:, k + 5, None]
-        e1, e2 = u[one][:, None], u[two][:, None]
-        P, Q, R = z[one], z[two], at.ends[d]
-        push = pushes[d]
-        force[one][:, 2] += push
-        moment[one][:, 2] += _cross(R - P, push)
-        result[:, k + 4, 2] += _dot(u[one], push)
-        sine, cosine = _cross(e1, e2), _dot(e1, e2)
-        a1, a2 = moment[one] / (r1[:, None] * sine), moment[two] / (r2[:, None] * sine)
-        g = a1 * e2 + a2 * e1
-        result[:, k + 4] -= a1 * cosine + a2
-        result[:, k + 5] += a1 + a2 * cosine
-        at_first, at_second = force[one] - g, force[two] + g
-        s, c = squeeze[d], at.cosines[d]
-        result[:, k + 4, 2] += s * (1.0 / r2 - c / r1)
-        result[:, k + 5, 2] += s * (1.0 / r1 - c / r2)
-        of_way = -s / (r1 * r2) * (Q - P)
-        at_first[:, 2] += pulls[0, d] - of_way
-        at_second[:, 2] += pulls[1, d] + of_way
-        load(topology.first[:, d], P, at_first, k)
-        load(topology.second[:, d], Q, at_second, k + 2)
+        k, first, second = HEAD + EACH * d, BASE + 2 * d, BASE + 2 * d + 1
+        A, B, one, two = topology.first[:, d], topology.second[:, d], x[:, k + 4, None], x[:, k + 5, None]
+        force[first][:, 2] += pulls[0, d] + pushes[d]
+        moment[first][:, 2] += cross(at.ends[d] - z[first], pushes[d])
+        force[second][:, 2] += pulls[1, d]
+        P, Q, point = z[first], z[B, lanes] + u[B, lanes] * _complex(x, k + 2), z[second]
+        for form, w in lanes_of_forms(topology.form[:, d]):
+            dyads = Dyads(P[w], Q[w], at.ends[d, w], u[first, w], u[second, w], one[w], two[w], at.cosines[d, w])
+            found = balance(form, dyads, moment[first, w], force[second, w], moment[second, w], squeeze[d, w])
+            outward = dyads.turn1 * (1j if form == SLIDE else 1.0)
+            result[w, k + 4] += found.by_one
+            result[w, k + 4, 2] += dot(outward, pushes[d, w])
+            result[w, k + 5] += found.by_two
+            moment[B[w], lanes[w]] += found.couple
+            load(A[w], w, P[w], force[first, w] - found.force, k)
+            load(B[w], w, point[w], force[second, w] + found.force, k + 2)
     for k, crank in ((0, 1), (SECOND, GEARED)):
         result[:, k] += np.real(force[crank])
         result[:, k + 1] += np.imag(force[crank])

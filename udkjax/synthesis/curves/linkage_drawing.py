@@ -10,7 +10,9 @@ from udkjax.positions.assembling.channels import locate
 from udkjax.positions.following.kinematics import FULL_TURN, kinematics
 from udkjax.scene.drawing import Drawing
 from udkjax.scene.drawing.drawn_quantities import Units
+from udkjax.scene.elements.bodies import GROUND
 from udkjax.scene.mechanism import Mechanism
+from udkjax.synthesis.curves.dyad_forms import PINS, RAIL, SLIDE
 from udkjax.synthesis.curves.dyads import BASE, EACH, GEARED, HEAD, SECOND, TAIL, Topology, positions
 from udkjax.synthesis.curves.targets import WantedCurve
 
@@ -37,15 +39,17 @@ def pins_of_linkage(x: np.ndarray, topology: Topology) -> dict[str, list[LinkPoi
     names = iter([*LETTERS, *(f"{a}{k}" for k in range(1, 10) for a in LETTERS)])
     for d in range(topology.dyads):
         k, one, two = HEAD + EACH * d, BASE + 2 * d, BASE + 2 * d + 1
-        a, b, c = next(names), next(names), next(names)
-        pins[a] = [(int(topology.first[0, d]), complex(x[k], x[k + 1])), (one, 0j)]
-        pins[b] = [(int(topology.second[0, d]), complex(x[k + 2], x[k + 3])), (two, 0j)]
-        pins[c] = [(one, complex(x[k + 4])), (two, complex(x[k + 5]))]
+        form = int(topology.form[0, d])
+        pins[next(names)] = [(int(topology.first[0, d]), complex(x[k], x[k + 1])), (one, 0j)]
+        if form != RAIL:
+            pins[next(names)] = [(int(topology.second[0, d]), complex(x[k + 2], x[k + 3])), (two, 0j)]
+        if form != SLIDE:
+            pins[next(names)] = [(one, complex(x[k + 4])), (two, 0j if form == RAIL else complex(x[k + 5]))]
     return pins | {PIN: [(BASE + 2 * topology.dyads - 2, complex(x[-TAIL], x[-TAIL + 1]))]}
 
 
 def _link_name(number: int) -> str:
-    return f"link{number - BASE + 1}" if number >= BASE else {1: "crank", GEARED: "crank2"}[number]
+    return f"link{number - BASE + 1}" if number >= BASE else (GROUND, "crank", "crank2")[number]
 
 
 def drawing_of(x: np.ndarray, topology: Topology, wanted: WantedCurve, name: str, unit: str = "m") -> Drawing:
@@ -62,8 +66,20 @@ def drawing_of(x: np.ndarray, topology: Topology, wanted: WantedCurve, name: str
             members.setdefault(link, []).append(pin)
     links = {_link_name(k): _link(members[k], places, wanted.extent, size) for k in sorted(members) if k}
     written = {pin: (z.real, z.imag) for pin, z in places.items()}
+    slides = []
+    for d in np.flatnonzero(topology.form[0] != PINS):
+        on = int(topology.second[0, d]) if topology.form[0, d] == RAIL else BASE + 2 * d
+        turn = complex(at.turns[BASE + 2 * d + 1, 0, 0])
+        slides.append({"link": _link_name(BASE + 2 * d + 1), "direction": (turn.real, turn.imag), "on": _link_name(on)})
     motor, units = {"pin": "O", "speed": SPEED}, {"length": unit}
-    rest: dict[str, Any] = {"ground": members[0], "motors": [motor], "gravity": (0.0, 0.0), "name": name, "units": units}
+    rest: dict[str, Any] = {
+        "ground": members[0],
+        "motors": [motor],
+        "slides": slides,
+        "gravity": (0.0, 0.0),
+        "name": name,
+        "units": units,
+    }
     if ratio := int(topology.ratio[0]):
         wheel = WHEELS * max(abs(places["O2"] - places["O"]), WIDTH * wanted.extent / size) / (1 + abs(ratio))
         belt = "open" if ratio > 0 else "crossed"
@@ -72,9 +88,9 @@ def drawing_of(x: np.ndarray, topology: Topology, wanted: WantedCurve, name: str
 
 
 def _link(pins: list[str], places: dict[str, complex], extent: float, size: float) -> dict[str, Any]:
-    """Return the table of a link through pins: a bar, or a plate whose corners are in order about its middle."""
+    """Return the table of a link: a disc or a bar, or a plate whose corners are in order about its middle."""
     shape = {"density": DENSITY, "thickness": THICKNESS * extent / size}
-    if len(pins) == 2:
+    if len(pins) <= 2:
         return {"pins": pins, "width": WIDTH * extent / size, **shape}
     z = np.array([places[pin] for pin in pins])
     order = np.argsort(np.angle(z - z.mean()), kind="stable")

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from udkjax.synthesis.curves.descent import FULL_TURN, LinkageLimits
+from udkjax.synthesis.curves.dyad_forms import RAIL
 from udkjax.synthesis.curves.dyads import BASE, EACH, HEAD, PHASE, SECOND, SPAN, Topology, positions
 from udkjax.synthesis.curves.random_linkages import Linkages, random_linkages, turn_angles
 from udkjax.synthesis.curves.targets import WantedCurve, resampled
@@ -31,9 +32,10 @@ def find_starts(
     keep: int,
     rng: np.random.Generator,
     geared: bool = False,
+    slides: float = 0.0,
 ) -> Linkages:
     """Return the linkages whose curves are most similar to the target, of `samples` random ones, moved onto it."""
-    x, topology = random_linkages(samples, dyads, rng, geared)
+    x, topology = random_linkages(samples, dyads, rng, geared, slides)
     at = positions(x, topology, turn_angles(samples))
     turns = (np.abs(at.cosines) < limits.cosine).all((0, 2))
     x, topology = x[turns], topology.take(turns)
@@ -116,6 +118,8 @@ def _moved(x: np.ndarray, topology: Topology, factor: np.ndarray, offset: np.nda
         k = HEAD + EACH * d
         for j, link in ((k, topology.first[:, d]), (k + 2, topology.second[:, d])):
             move(j, of_link[np.minimum(link, BASE), rows], np.where(link == 0, offset, 0.0))
-        x[:, k + 4 : k + 6] *= size[:, None]
+        turned = np.angle(of_link[np.minimum(topology.second[:, d], BASE), rows])
+        x[:, k + 4] *= size
+        x[:, k + 5] = np.where(topology.form[:, d] == RAIL, x[:, k + 5] + turned, x[:, k + 5] * size)
     move(x.shape[1] - 2, size + 0j, 0.0)
     return x

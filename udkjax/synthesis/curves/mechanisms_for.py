@@ -20,6 +20,7 @@ SIZE = 3.0  # of a mechanism by default: largest distance of its pins from the m
 TRANSMISSION = float(np.deg2rad(8.0))  # smallest transmission angle by default
 SHORTEST = 0.02  # smallest distance of two joints of a dyad's link, in extents of the curve
 WORTH = 0.03  # fraction by which two more bars must reduce the error to be worth it
+SLIDES = 1 / 3  # fraction of dyads that have a slide, if they may
 # Two samples of the same curve differ by a quarter of the distance of their points each way; a search ends when the rest is less.
 ENOUGH = 5e-4
 GROWING = 0.9  # fraction of the time after which linkages are only finished and verified
@@ -38,6 +39,7 @@ def mechanisms_for(
     rounds: Annotated[int, COUNT] | None = None,
     error: Annotated[float, NOT_NEGATIVE] | None = None,
     geared: bool = True,
+    slides: bool = False,
     unit: str = "m",
     progress: ProgressOption = None,
 ) -> CurveDesigns:
@@ -65,6 +67,8 @@ def mechanisms_for(
         error: error, relative to the RMS radius of the curve, with which a design is good enough: the search ends with the first
             one. By default it ends after a round, when the drawn curve is as near as samples of the same curve are to each other.
         geared: whether a second crank, joined to the first by a belt, is allowed.
+        slides: whether a third of all dyads has a slide in the place of a pin: a link slides along another one, or on a rail of
+            another one or of the ground. By default, all joints are pins: in equal time, they draw letters better.
         unit: unit of lengths of the drawings, such as "mm"; it does not change the mechanisms.
         progress: as for `sweep`: None shows progress after two seconds, False never; or a function of a `Progress`. Ctrl-C ends
             the search with the best designs so far.
@@ -80,7 +84,7 @@ def mechanisms_for(
     if bars < FEWEST_BARS:
         raise ValueError(f"bars must be at least {FEWEST_BARS}: the ground, a crank and a dyad; not {bars}")
     wanted = WantedCurve(curve, part == "whole")
-    search = CurveSearch(wanted, curve_limits(wanted, size, float(transmission)), int(bars), int(seed), geared)
+    search = CurveSearch(wanted, curve_limits(wanted, size, float(transmission)), int(bars), int(seed), geared, SLIDES * slides)
     begun = time.process_time()
     done = _run(search, float(seconds), rounds, error, begun, progress)
     found = ranked(search.found, wanted, int(results), WORTH, unit)

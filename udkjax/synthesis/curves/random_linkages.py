@@ -1,12 +1,14 @@
 """Random linkages whose crank turns.
 
-A dyad closes over the whole turn if the sum of its lengths exceeds the largest distance of P and Q, and their difference is below
-the smallest: lengths are drawn within these limits, so that no linkage is rejected because its crank cannot turn.
+A dyad of pins closes over the whole turn if the sum of its lengths exceeds the largest distance of P and Q, and their difference
+is below the smallest; with a rail, if its length exceeds the largest distance of P from the rail; with a slide, if its offset is
+below the smallest distance of P and Q. Numbers are drawn within these limits, so that few linkages are rejected.
 """
 
 import numpy as np
 
 from udkjax.synthesis.curves.descent import FULL_TURN, Sampling
+from udkjax.synthesis.curves.dyad_forms import PINS, RAIL, SLIDE, cross
 from udkjax.synthesis.curves.dyads import (
     BASE,
     EACH,
@@ -32,13 +34,13 @@ def turn_angles(K: int) -> np.ndarray:
     return np.broadcast_to(np.arange(MATCHED_ANGLES) * (FULL_TURN / MATCHED_ANGLES), (K, MATCHED_ANGLES))
 
 
-def random_linkages(K: int, dyads: int, rng: np.random.Generator, geared: bool = False) -> Linkages:
+def random_linkages(K: int, dyads: int, rng: np.random.Generator, geared: bool = False, slides: float = 0.0) -> Linkages:
     """Return K random linkages with cranks of about unit length; geared ones begin with a five-bar of two cranks."""
     x = np.zeros((K, number_count(dyads)))
     x[:, SPAN] = FULL_TURN
     first, second = np.ones((K, dyads), int), np.zeros((K, dyads), int)
     ratio = rng.choice(RATIOS, K) if geared else np.zeros(K, int)
-    topology = Topology(first, second, rng.choice([-1.0, 1.0], (K, dyads)), ratio)
+    topology = Topology(first, second, rng.choice([-1.0, 1.0], (K, dyads)), random_forms((K, dyads), slides, rng), ratio)
     x[:, HEAD] = np.exp(rng.normal(0.0, 0.3, K))
     pivot = np.exp(rng.normal(0.7, 0.5, K)) * np.exp(1j * rng.uniform(0.0, FULL_TURN, K))
     at = HEAD + 2
@@ -53,9 +55,9 @@ def random_linkages(K: int, dyads: int, rng: np.random.Generator, geared: bool =
             A, B = rng.choice(links, (2, K), p=likely / likely.sum())
             A = np.where(A == B, np.where(links - 2 == B, links - 1, links - 2), A)
             first[:, d], second[:, d] = A, B
-            x[:, k : k + 2], x[:, k + 2 : k + 4] = random_places(x, A, rng), random_places(x, B, rng)
+            x[:, k : k + 2], x[:, k + 2 : k + 4] = random_places(x, topology, A, rng), random_places(x, topology, B, rng)
         x[:, k + 4 : k + 6] = closing_lengths(x, topology, turn_angles(K), d, rng)
-    length = x[:, -TAIL - 2]
+    length = link_lengths(x, topology, np.full(K, BASE + 2 * dyads - 2))
     x[:, -2], x[:, -1] = rng.uniform(-1.0, 2.0, K) * length, rng.normal(0.0, 1.0, K) * length
     return x, topology
 
@@ -65,26 +67,49 @@ def closing_lengths(x: np.ndarray, topology: Topology, theta: np.ndarray, d: int
     k = HEAD + EACH * (d + 1)
     known = np.concatenate([x[:, :k], x[:, -TAIL:]], 1)
     known[:, k - 2 : k] = 1.0
-    part = topology._replace(first=topology.first[:, : d + 1], second=topology.second[:, : d + 1], side=topology.side[:, : d + 1])
-    at = positions(known, part, theta)
-    distance = np.abs(at.origins[-1] - at.origins[-2])
-    far, near = distance.max(1), distance.min(1)
-    total = far * (1.03 + rng.exponential(0.5, len(far)))
-    difference = near * rng.uniform(-0.97, 0.97, len(far))
-    return np.stack([0.5 * (total + difference), 0.5 * (total - difference)], 1)
+    first, second, side, form = (a[:, : d + 1] for a in topology[:4])
+    pinned = np.concatenate([form[:, :d], np.full((len(x), 1), PINS)], 1)
+    at = positions(known, Topology(first, second, side, pinned, topology.ratio), theta)
+    way, angle = at.origins[-1] - at.origins[-2], rng.uniform(0.0, FULL_TURN, len(x))
+    far, near = np.abs(way).max(1), np.abs(way).min(1)
+    above, between = 1.03 + rng.exponential(0.5, len(x)), rng.uniform(-0.97, 0.97, len(x))
+    rail = at.turns[second[:, d], np.arange(len(x))] * np.exp(1j * angle[:, None])
+    one = (0.5 * (far * above + near * between), np.abs(cross(rail, way)).max(1) * above, near * between)
+    two = (0.5 * (far * above - near * between), angle, far)
+    return np.stack([np.choose(form[:, d], one), np.choose(form[:, d], two)], 1)
 
 
-def random_places(x: np.ndarray, link: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def random_forms(shape: tuple[int, ...], slides: float, rng: np.random.Generator) -> np.ndarray:
+    """Return random forms of dyads, of which the share `slides` has a slide; without slides, no random number is drawn."""
+    if not slides:
+        return np.full(shape, PINS)
+    return np.where(rng.random(shape) < slides, rng.choice([RAIL, SLIDE], shape), PINS)
+
+
+def link_lengths(x: np.ndarray, topology: Topology, link: np.ndarray) -> np.ndarray:
+    """Return a usual length (K,) of a link of each dyad."""
+    rows, (dyad, other) = np.arange(len(x)), np.divmod(np.maximum(link - BASE, 0), 2)
+    form = topology.form[rows, np.minimum(dyad, topology.dyads - 1)]
+    return x[rows, np.minimum(HEAD + EACH * dyad + 4 + np.where(form == PINS, other, form == SLIDE), x.shape[1] - 1)]
+
+
+def random_places(x: np.ndarray, topology: Topology, link: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Return a random place (K, 2) on a link of each linkage, in its frame."""
-    K = len(x)
-    dyad, other = np.divmod(np.maximum(link - BASE, 0), 2)
-    length = x[np.arange(K), np.minimum(HEAD + EACH * dyad + 4 + other, x.shape[1] - 1)]
+    K, length = len(x), link_lengths(x, topology, link)
     between = np.stack([rng.uniform(-0.6, 1.6, K) * length, rng.normal(0.0, 0.5, K) * length], 1)
     about = rng.normal(0.0, np.where(link == 0, 2.0, 0.8)[:, None], (K, 2))
     return np.where((link >= BASE)[:, None], between, about)
 
 
-def grown(linkages: Linkages, target: CurveTarget, sample: Sampling, tries: int, keep: int, rng: np.random.Generator) -> Linkages:
+def grown(
+    linkages: Linkages,
+    target: CurveTarget,
+    sample: Sampling,
+    tries: int,
+    keep: int,
+    rng: np.random.Generator,
+    slides: float = 0.0,
+) -> Linkages:
     """Return `keep` linkages with one more dyad for each of the given ones, the best of `tries`.
 
     The P of the new dyad is the old drawing pin, so that with the new pin at P the curve is the old one; the place of the new pin
@@ -101,10 +126,10 @@ def grown(linkages: Linkages, target: CurveTarget, sample: Sampling, tries: int,
     B += links - 2 == B
     B = np.where(rng.random(n) < 0.3, 0, B)
     k = HEAD + EACH * D
-    y = np.concatenate([x[:, :k], x[:, -TAIL:], random_places(x, B, rng), np.ones((n, 2)), np.zeros((n, 2))], 1)
+    y = np.concatenate([x[:, :k], x[:, -TAIL:], random_places(x, topology, B, rng), np.ones((n, 2)), np.zeros((n, 2))], 1)
     side = rng.choice([-1.0, 1.0], (n, 1))
-    first, second, sides = (np.concatenate(pair, 1) for pair in zip(topology[:3], (A[:, None], B[:, None], side), strict=True))
-    new = Topology(first, second, sides, topology.ratio)
+    added = A[:, None], B[:, None], side, random_forms((n, 1), slides, rng)
+    new = Topology(*(np.concatenate(pair, 1) for pair in zip(topology[:4], added, strict=True)), topology.ratio)
     theta = sample.angles(y)
     y[:, k + 4 : k + 6] = closing_lengths(y, new, theta, D, rng)
     at = positions(y, new, theta)
