@@ -372,3 +372,21 @@ def test_klann_s_foot_steps_along_a_line():
     assert 0.06 < step < 0.07 and 0.3 < lift / step < 0.6
     low = foot[foot[:, 1] < foot[:, 1].min() + 0.05 * step]
     assert len(low) > 0.45 * len(foot) and np.ptp(low[:, 0]) > 0.95 * step
+
+
+def test_gaps_are_those_of_the_function_with_outlines_as_drawn(client):
+    mech, shown = udk.loads(SIX_BAR), client.ask("diagnose", text=SIX_BAR, about="gaps").json()
+    found = udk.gaps(mech)
+    assert [(row["words"], row["gap"], row["at"]) for row in shown["gaps"]] == found.rows()
+    assert [row["touches"] for row in shown["gaps"]] == [gap.distance <= 0 for gap in found.pairs]
+    assert shown["remarks"] == found.remarks() and shown["counted"] == "the angle of O2-A from the x axis"
+    least = udk.kinematics(mech, "motor1", [found.least.value])
+    assert np.array(shown["gaps"][0]["q"]).reshape(-1, 3) == pytest.approx(np.asarray(least.q)[0], abs=1e-9)
+    of = {mech.body_names[part["body"]]: part for part in shown["parts"]}
+    ends = sorted(map(tuple, of["crank"]["points"]))
+    assert np.array(ends) == pytest.approx(np.array([[0.0, 0.0], [0.03, 0.04]]), abs=1e-12) and of["crank"]["radius"] == 0.0075
+    assert [
+        sorted({mech.body_names[shown["parts"][k]["body"]] for k in numbers}) for pair in shown["pairs"] for numbers in pair
+    ] == [[name] for gap in found.pairs for name in gap.pair]
+    bare = SIX_BAR.replace("density = 7850\nthickness = 5\nwidth = 15", "mass = 1", 1)
+    assert "no width" in client.ask("diagnose", text=bare, about="gaps").json()["problems"][0]

@@ -230,3 +230,32 @@ def test_nothing_is_cut_off_beside_the_answers_and_text_has_contrast(browser, se
                 assert studio.js("studio.curves.canvas.clientHeight") > 100, name
                 found = studio.js(CONTRAST)
                 assert found["ratio"] >= LEAST_CONTRAST, (name, found)
+
+
+@pytest.mark.slow
+def test_links_that_touch_are_red_and_a_click_shows_where_they_are_closest(studio):
+    wide = FOUR_BAR.replace('name = "crank"', 'name = "crank"\nwidth = 70').replace(
+        'name = "rocker"', 'name = "rocker"\nwidth = 70'
+    )
+    (studio.folder / "wide.toml").write_text(wide, encoding="utf-8")
+    studio.js("studio.files.openFile('wide.toml')")
+    studio.settle()
+    found = udk.gaps(udk.loads(wide))
+    studio.page.get_by_role("button", name="find how close links come").click()
+    studio.until("studio.answers.gaps.found !== null")
+    text = studio.page.locator("details.answers").inner_text()
+    (row,) = found.rows()
+    assert all(words in text for words in (*row, *found.remarks()))
+    painted = "studio.answers.gaps.draw(studio.canvas.painter).size"
+    studio.page.get_by_role("button", name=f"show {row[0]} where they are closest").click()
+    studio.page.wait_for_timeout(100)
+    q = studio.js("Array.from(studio.motion.pageEngine.at(studio.motion.run, studio.motion.t).q)")
+    np.testing.assert_allclose(np.reshape(q, (-1, 3)), found.least.q, atol=1e-5)
+    assert found.least.distance < 0 and studio.js(painted) == 2
+    away = found.least.value + np.pi  # half a turn later, links are apart
+    studio.js(f"studio.motion.goTo('{np.degrees(away + found.count.offset):.6f} deg')")
+    studio.page.wait_for_timeout(100)
+    assert studio.js(painted) == 0
+    studio.js("studio.commit({...studio.document, pins: {...studio.document.pins, E: [10, 10]}})")
+    assert studio.js("studio.answers.gaps.found") is None
+    assert not studio.problems

@@ -12,10 +12,10 @@ def check(scene: Scene, /, json: Json = False) -> None:
         scene: the mechanism.
     """
     mech, _ = load(scene)
-    from udkjax.positions.answers.scene_check import check as checked
+    import udkjax as udk
     from udkjax.show.summary import check_summary
 
-    report = checked(mech)
+    report = udk.check(mech)
     results = {
         **report._asdict(),
         "redundant": [{"constraint": name, "row": row} for name, row in report.redundant],

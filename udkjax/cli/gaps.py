@@ -62,5 +62,4 @@ def gaps(
         text += f"\n\n{passed!r}"
     show(results, text, json)
     if found.contacts and not layers:
-        overlap = counted.units.text(-float(found.least.distance), "m")
-        fail(f"{' and '.join(found.least.pair)} overlap by {overlap}")
+        fail(found.summary())

@@ -9,10 +9,10 @@ from udkjax.cli.datasets import load_to_write, write
 from udkjax.extras import OptionalImport
 
 if TYPE_CHECKING:
+    from udkjax import Travel
     from udkjax.annotations import Numbers
     from udkjax.cli.common import Columns
     from udkjax.positions.answers.counting import Count
-    from udkjax.positions.following.kinematics import Travel
 
 with OptionalImport():
     import tyro

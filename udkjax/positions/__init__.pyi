@@ -16,7 +16,6 @@ from udkjax.positions.answers.pin_motion import pin_motion as pin_motion
 from udkjax.positions.answers.pin_motion import usual_rate as usual_rate
 from udkjax.positions.answers.pressure import pressure_angle as pressure_angle
 from udkjax.positions.answers.scene_check import Check as Check
-from udkjax.positions.answers.scene_check import check as check
 from udkjax.positions.answers.transmission import Workspace as Workspace
 from udkjax.positions.answers.transmission import coupler_curve as coupler_curve
 from udkjax.positions.answers.transmission import mechanical_advantage as mechanical_advantage
@@ -70,7 +69,6 @@ from udkjax.positions.following.free_numbers import FreeNumbers as FreeNumbers
 from udkjax.positions.following.free_numbers import position_model as position_model
 from udkjax.positions.following.kinematics import FULL_TURN as FULL_TURN
 from udkjax.positions.following.kinematics import Kinematics as Kinematics
-from udkjax.positions.following.kinematics import Travel as Travel
 from udkjax.positions.following.kinematics import kinematics as kinematics
 from udkjax.positions.following.kinematics import motion_in_time as motion_in_time
 from udkjax.positions.following.kinematics import travel as travel

@@ -11,6 +11,7 @@ from udkjax.show.player import Animation as Animation
 from udkjax.show.player import animate as animate
 from udkjax.show.player import animate_modes as animate_modes
 from udkjax.show.player.animation import FailedRunWarning as FailedRunWarning
+from udkjax.show.player.gap_records import outlines as outlines
 from udkjax.show.player.marks.measure_curves import ShownMotion as ShownMotion
 from udkjax.show.player.marks.measure_curves import measures_of as measures_of
 from udkjax.show.player.run_files import read_run as read_run

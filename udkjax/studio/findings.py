@@ -17,9 +17,11 @@ from udkjax.positions.assembling.coordinates import value_of
 from udkjax.positions.following.continuation import Reached
 from udkjax.positions.following.drive import only_driver
 from udkjax.positions.following.kinematics import kinematics, travel
+from udkjax.positions.gaps.gaps import gaps
 from udkjax.scene.elements.joints import Revolute
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.tables.checks import SceneError
+from udkjax.show.player.gap_records import outlines
 from udkjax.statics.equilibrium import equilibrium
 from udkjax.statics.resting_forces import forces_table
 from udkjax.studio.drawn_fixes import drawn_fix
@@ -40,7 +42,7 @@ def examine(mechanism: Mechanism, text: str, about: str, end: JsonObject | None 
         text: text of the drawing.
         about: "structure" (degrees of freedom, redundant constraints, reactions), "travel" (of each motor), "dynamics" (curves
             of forces), "rest" (an equilibrium), "holding" (curves of holding torques and forces), "answers" (the answers of a
-            course), or "end" (the cause of the early end of a run).
+            course), "gaps" (between links), or "end" (the cause of the early end of a run).
         end: for "answers", the value `at` of the motor, a text with its unit; for "end", a state `t`, `q`, `v` of the run, as the
             page sends it, and the time `end` (s) at which it ended.
     """
@@ -53,6 +55,7 @@ def examine(mechanism: Mechanism, text: str, about: str, end: JsonObject | None 
         "rest": rest,
         "holding": holding_curves,
         "answers": partial(answers, at=(end or {}).get("at")),
+        "gaps": least_gaps,
     }
     if about not in subjects:
         raise RefusedError(400, f"about: must be one of {', '.join(subjects)}")
@@ -77,6 +80,18 @@ def answers(mechanism: Mechanism, at: object = None) -> JsonObject:
         tables.insert(2, forces)
     shown = [{"title": x.title, "heads": list(x.heads), "rows": [[str(cell) for cell in row] for row in x.rows]} for x in tables]
     return {"answers": lines, "tables": shown}
+
+
+def least_gaps(mechanism: Mechanism) -> JsonObject:
+    """Return the least gap of each pair of links over the range of the motor, its pose, and the outlines of links as drawn."""
+    found = gaps(mechanism, only_driver(mechanism))
+    frames = {name: np.array([*np.asarray(body.position), body.angle]) for name, body in mechanism.bodies.items()}
+    rows = [
+        {"words": words, "gap": gap, "at": at, "touches": float(least.distance) <= 0, "q": np.ravel(least.q).tolist()}
+        for (words, gap, at), least in zip(found.rows(), found.pairs, strict=True)
+    ]
+    counted = "" if found.count is None else found.count.words
+    return {"gaps": rows, "counted": counted, "remarks": found.remarks(), **outlines(found, mechanism.body_names, frames)}
 
 
 def _cause(mechanism: Mechanism, end: JsonObject) -> str:

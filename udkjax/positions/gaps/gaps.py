@@ -17,7 +17,7 @@ from udkjax.positions.gaps.derivatives import differentiable_gaps
 from udkjax.positions.gaps.motion import motion_of_drive, motion_of_run
 from udkjax.positions.gaps.pairs import LinkPair, pairs_to_check
 from udkjax.positions.gaps.search import search
-from udkjax.positions.gaps.shapes import parts_of
+from udkjax.positions.gaps.shapes import ConvexPart, parts_of
 from udkjax.printing import PrintedTable, PrintsTable, fields_table, format_number, has_numbers, prints_table, units
 from udkjax.requirements import ArgumentError, ArgumentTypeError, GivenArguments, array, describe, require_finite
 from udkjax.scene.arguments import checked
@@ -60,6 +60,7 @@ class LeastGap(NamedTuple):
         distance: the gap (m); negative if the links overlap, by the way on which they come apart soonest.
         bound: the gap (m) below which none is, between samples either.
         points: the closest points of the outlines (m), the first on the first link.
+        q: the pose (bodies, 3) in which it is least (m, m, rad).
     """
 
     pair: LinkPair
@@ -67,8 +68,9 @@ class LeastGap(NamedTuple):
     distance: Any
     bound: float
     points: Numbers
+    q: Numbers
 
-    _units = units(distance="m", bound="m", points="m")
+    _units = units(distance="m", bound="m", points="m", q="m, m, rad")
 
 
 @prints_table
@@ -95,6 +97,8 @@ class LeastGaps(PrintsTable):
         unit: of the values.
         missing: the share of the range that is not reached, or in which a run has failed: nothing is known there.
         count: the zero and the units in which values and lengths are shown; None: SI units.
+        parts: the convex outlines between which gaps are measured: of each, the name of its link, its corners in the frame of the
+            link (m), and a radius around them (m).
     """
 
     pairs: tuple[LeastGap, ...]
@@ -102,6 +106,7 @@ class LeastGaps(PrintsTable):
     unit: str = eqx.field(static=True, default="")
     missing: float = eqx.field(static=True, default=0.0)
     count: Count | None = eqx.field(static=True, default=None)
+    parts: tuple[ConvexPart, ...] = ()
 
     @property
     def least(self) -> LeastGap:
@@ -112,6 +117,11 @@ class LeastGaps(PrintsTable):
         """Return the links of each pair, their least gap, and the value at which it is least, as texts in the drawing's units."""
         size = max(float(np.max(np.abs(np.asarray(gap.points)))) for gap in self.pairs)
         return [(" and ".join(x.pair), self._length(x.distance, size), self._value(x.value)) for x in self.pairs]
+
+    def summary(self) -> str:
+        """Return in words, in the drawing's units, which links come closest, or overlap most."""
+        (pair, gap, _), overlaps = self.rows()[0], float(self.least.distance) < 0
+        return f"{pair} overlap by {gap.removeprefix('-')}" if overlaps else f"least gap of {pair}: {gap}"
 
     def remarks(self) -> list[str]:
         """Return sentences, in the drawing's units, on where links touch and on how much of the range is not reached."""
@@ -202,10 +212,10 @@ def gaps(
         Touch(pair, *motion.value(np.array(ends)).tolist()) for pair, x in zip(checked_pairs, touches, strict=True) for ends in x
     ]
     found = [
-        LeastGap(pair, float(motion.value(x.u)), d, x.bound, x.places)
+        LeastGap(pair, float(motion.value(x.u)), d, x.bound, x.places, motion.at(np.array([x.u]), np.array([x.piece]))[0][0, :-1])
         for pair, x, d in zip(checked_pairs, least, distances, strict=True)
     ]
     order = np.argsort([x.distance for x in least], kind="stable")
     contacts.sort(key=lambda x: (x.begins, x.ceases))
     count = Count.of_run(concrete, motion.unit) if run is not None else Count.of(concrete, driver_now)
-    return LeastGaps(tuple(found[k] for k in order), tuple(contacts), motion.unit, motion.missing, count)
+    return LeastGaps(tuple(found[k] for k in order), tuple(contacts), motion.unit, motion.missing, count, tuple(parts))

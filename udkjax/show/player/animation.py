@@ -18,6 +18,7 @@ from udkjax.integrate.simulate import simulate
 from udkjax.scene.arguments import checked, require_mechanism
 from udkjax.scene.mechanism import Mechanism
 from udkjax.show.player import pictures
+from udkjax.show.player.gap_records import ShownGaps, add_gaps
 from udkjax.show.player.live import live_data
 from udkjax.show.player.live_parameters import Live
 from udkjax.show.player.marks.drawn_systems import PlacesBodies, drawn_system
@@ -165,6 +166,7 @@ def animate(
     targets: Numbers | None = None,
     title: str | None = None,
     live: Live = False,
+    gaps: ShownGaps = False,
     events: ExpandsToEvents | Sequence[ExpandsToEvents] = (),
 ) -> Animation:
     """Show the motion of a mechanism, or several motions side by side and synchronized.
@@ -193,6 +195,9 @@ def animate(
             slider; True adds sliders for all numbers of the scene. A slider acts on all runs that have its parameter. Without
             `solution`, ten seconds are simulated. A live page has all of these, which follow its numbers, but
             "rank"; your own measures are shown for the first motion only.
+        gaps: True to paint links red while they touch, with marks on the timeline where they begin and cease to, and a button
+            that leads to the least gap between links; for other pairs or shapes than those of `udkjax.gaps` by default, its
+            result for the run, or results by label. A live page, whose motion changes, has none.
         events: events of live runs, as for `simulate`; the page locates them in each new motion. It supports the actions `Log`,
             `Stop` and `Impact` (one contact at a time), and draws the lines of contacts.
 
@@ -212,6 +217,8 @@ def animate(
     events = tuple(events) if isinstance(events, Sequence) else (events,)
     if events and not live:
         raise ValueError("events: needed only for a live page; otherwise the events of the solution are shown: leave them out")
+    if gaps and live:
+        raise ValueError("gaps are those of a run, which a live page changes: leave out gaps or live")
     if live:
         solution, measures = _live_runs(mechanism, solution, measures, events)
     runs: dict[str, ShownMotion | None] = dict(solution) if isinstance(solution, Mapping) else {"": solution}
@@ -223,8 +230,11 @@ def animate(
         run = _Still(mech) if run is None else run
         require_history(f"solution[{label!r}]" if label else "solution", run, {"mechanism": mech})
         conditions = [event.condition for event in (expand_events(events, mech) if events else ())]
-        gaps = [condition for condition in conditions if isinstance(condition, Gap)]
-        records.append((mech, *run_record(mech, run, label, measures, reactions, traces, shapes, gaps, targets)))
+        lines = [condition for condition in conditions if isinstance(condition, Gap)]
+        record, poses = run_record(mech, run, label, measures, reactions, traces, shapes, lines, targets)
+        if gaps:
+            add_gaps(record, mech, run, gaps.get(label) if isinstance(gaps, Mapping) else gaps)
+        records.append((mech, record, poses))
         if failure := failure_of(run):
             failures[label] = failure
             warnings.warn(f"run {label!r} failed: {failure}" if label else f"the run failed: {failure}", FailedRunWarning, 2)

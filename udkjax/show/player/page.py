@@ -11,6 +11,7 @@ from udkjax.annotations import JsonObject
 
 # Modules of the player; each follows those that it imports.
 SHOWING = ("motion", "labels", "painter", "symbols", "strip", "style", "elements", "event_marks", "pointers")
+GAPS = ("gap_marks",)  # of pages that show gaps between links
 # Modules of live pages only.
 SOLVING = ("events", "engine", "symbol_updates", "hand", "sliders", "address", "part_run", "pin_measures", "live_run", "live")
 LAST = ("player", "mount")
@@ -24,7 +25,7 @@ def page(data: JsonObject, options: JsonObject | None = None) -> str:
     return template.substitute(
         title=html.escape(data["title"]),
         data=as_json(data),
-        module=module(is_live="live" in data),
+        module=module(is_live="live" in data, has_gaps=any("gaps" in run for run in data["runs"])),
         options=as_json({"fill": True, **(options or {})}),
     )
 
@@ -42,12 +43,12 @@ def as_json(data: object) -> str:
 
 
 @cache
-def module(is_live: bool = True) -> str:
+def module(is_live: bool = True, has_gaps: bool = True) -> str:
     """Return the source of the player: its modules joined into one, without comment lines.
 
     Half of the source are modules that only a live page needs.
     """
-    names = (*SHOWING, *(SOLVING if is_live else ()), *LAST)
+    names = (*SHOWING, *(GAPS if has_gaps else ()), *(SOLVING if is_live else ()), *LAST)
     *sources, last = (files("udkjax.show.player").joinpath(f"{name}.js").read_text(encoding="utf-8") for name in names)
     joined = "\n".join([*(re.sub(r"^export ", "", source, flags=re.M) for source in sources), last])
     return re.sub(r"^(import .*| *//.*)?\n", "", joined, flags=re.M)

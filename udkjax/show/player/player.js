@@ -2,6 +2,7 @@
 
 import {HELP, LIVE_HELP, SPEEDS, button, icon, keepKeys, make} from "./elements.js";
 import {EventMarks} from "./event_marks.js";
+import {GapMarks, paintTouching} from "./gap_marks.js";
 import {Live} from "./live.js";
 import {Run, clamp} from "./motion.js";
 import {THEMES, contextOf} from "./painter.js";
@@ -56,15 +57,16 @@ export class Player {
     if (this.runs.some(run => run.traces.length)) this.buttons.traces = toggle("traces", "Traces", "T");
     if (this.runs.some(run => run.reactions)) this.buttons.reactions = toggle("reactions", "Reactions", "R");
     this.buttons.names = toggle("names", "Names", "N");
+    this.gaps = this.runs.some(run => run.gaps) ? new GapMarks(this) : null;
     this.panels = this.runs.map((run, k) => this.panel(run, k));
     this.stage = make("div", {class: "stage"}, ...this.panels.map(p => p.figure));
     this.live = data.live ? new Live(this, data) : null;
     const middle = this.live ? make("div", {class: "middle"}, this.stage, this.live.panel.element) : this.stage;
     this.help = make("div", {class: "help", hidden: "", onclick: () => this.toggleHelp()},
-      make("dl", {}, ...[...HELP, ...(data.live ? LIVE_HELP : [])].flatMap(([key, words]) => [make("dt", {}, key), make("dd", {}, words)])));
+      make("dl", {}, ...[...HELP, ...(data.live ? LIVE_HELP : []), ...(this.gaps ? [["G", "least gap"]] : [])].flatMap(([key, words]) => [make("dt", {}, key), make("dd", {}, words)])));
     this.eventMarks = new EventMarks(this);
     const groups = [this.playButton, this.timeLabel, this.eventMarks.element, make("div", {class: "group"}, ...(this.modes ? [] : [this.speedSelect]),
-      ...Object.entries(this.buttons).filter(([name]) => name !== "ghost").map(([, button]) => button))];
+      ...Object.entries(this.buttons).filter(([name]) => name !== "ghost").map(([, button]) => button), ...(this.gaps ? [this.gaps.button] : []))];
     if (this.modes) {
       const range = make("input", {type: "range", min: 0, max: 3, step: 0.01, value: 1, "aria-label": "amplitude",
         oninput: () => { this.amplitude = +range.value; this.draw(); }});
@@ -231,7 +233,7 @@ export class Player {
       Home: () => this.seek(start), End: () => this.seek(end), 0: () => this.whole(), "?": () => this.toggleHelp(),
       "+": () => this.setSpeed(speeds[Math.min(at + 1, speeds.length - 1)]), "-": () => this.setSpeed(speeds[Math.max(at - 1, 0)]),
       t: () => this.toggle("traces"), n: () => this.toggle("names"), r: () => this.toggle("reactions"), l: () => this.toggle("loop"),
-      d: () => this.switchTheme(), ...(this.live?.keys() ?? {}), Escape: () => { this.help.hidden = true; },
+      d: () => this.switchTheme(), ...(this.live?.keys() ?? {}), ...(this.gaps ? {g: this.gaps.show} : {}), Escape: () => { this.help.hidden = true; },
     };
     const action = actions[event.key] ?? actions[event.key.toLowerCase()];
     if (!action || (event.key === " " && ["BUTTON", "SUMMARY"].includes(target.tagName))) return;  // a button takes the space bar itself
@@ -282,6 +284,7 @@ export class Player {
       if (show.traces && !run.mode) painter.traces(run, t);
       painter.pose = run.pose(t, this.amplitude);
       painter.draw(run.symbols);
+      if (run.gaps) paintTouching(painter, run.gaps);
       painter.sticking(run, t);
       live?.paintHand(painter);
       if (show.reactions && run.reactions) painter.reactions(run, t, width, height);

@@ -22,6 +22,7 @@ runs       a list of
     sticking       a list of {name, at: anchor, spans: [[from, to], ...]}: when each joint with set-valued friction sticks (s)
     reactions      {anchors, usual: force of an arrow of usual length (N), unique: booleans, force: packed table of T rows with x
                    and y of each anchor}, or null
+    gaps           only if they are asked for: the least gap between links and their outlines (gap_records.py)
 """
 
 from collections.abc import Callable, Sequence

@@ -3,28 +3,37 @@
 
 import {ask} from "./api.js";
 import {alongOf, turningMotors} from "./along.js";
+import {GapsPanel} from "./gaps.js";
 import {make} from "./player/elements.js";
 
 const DELAY = 200;  // ms without a change of position before the tables are asked for
 
 export class AnswersPanel {
   constructor(studio, element) {
-    Object.assign(this, {studio, element, text: null, lines: [], tables: [], asked: null, last: null});
+    Object.assign(this, {studio, element: make("div"), text: null, lines: [], tables: [], asked: null, last: null});
+    const gaps = make("div");
+    this.gaps = new GapsPanel(studio, gaps);
+    element.append(this.element, gaps);
     this.clear();
   }
 
   clear() {
     Object.assign(this, {text: null, lines: [], tables: [], last: null});
     clearTimeout(this.timer);
+    this.gaps.clear();
     this.element.replaceChildren(make("p", {}, "Strokes, dead points and ratios appear here once one motor moves the mechanism."));
   }
 
-  markStale() { this.element.classList.add("stale"); }
+  markStale() {
+    this.element.classList.add("stale");
+    this.gaps.clear();
+  }
 
   /** Ask for the answers of the drawing that a text describes. */
   async follow(text, isLate) {
     const at = this.position(), found = await ask("diagnose", {text, about: "answers", ...(at ? {end: {at}} : {})});
     if (isLate()) return;
+    if (text !== this.gaps.text) this.gaps.clear(found.answers?.length ? text : null);
     Object.assign(this, {text, last: at});
     this.show(found);
   }

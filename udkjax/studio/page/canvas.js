@@ -61,6 +61,7 @@ export class DrawingCanvas {
     this.outlines = this.symbols.map(symbol => this.outline(symbol, painter));
     this.halos(studio, painter, theme);
     painter.draw(this.symbols);
+    studio.answers.gaps.draw(painter);
     studio.vectors.draw(painter, theme);
     this.places = this.placesOf(document);
     this.names.begin(painter, this.places.values());

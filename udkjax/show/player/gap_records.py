@@ -1,0 +1,57 @@
+"""The gaps of a run as data of the player: the outlines that may touch, and the least gap of the motion."""
+
+from collections.abc import Mapping, Sequence
+from typing import TypeAlias
+
+import numpy as np
+
+from udkjax.annotations import JsonObject
+from udkjax.positions.gaps.gaps import LeastGaps, gaps
+from udkjax.scene.mechanism import Mechanism
+from udkjax.show.player.marks.measure_curves import ShownMotion
+
+ShownGaps: TypeAlias = "bool | LeastGaps | Mapping[str, LeastGaps]"
+
+
+def add_gaps(record: JsonObject, mechanism: Mechanism, run: ShownMotion, found: bool | LeastGaps | None) -> None:
+    """Add the gaps between links to the record of a run: the least one, outlines, and events where links touch and part.
+
+    Args:
+        record: the record (player_data.py).
+        mechanism: the mechanism of the run.
+        run: the run.
+        found: its gaps; True to find those of all pairs, False or None for a run without them.
+
+    Raises:
+        ValueError: they are not those of a run.
+    """
+    if not isinstance(found, LeastGaps):
+        if not found:
+            return
+        found = gaps(mechanism, run=run)
+    if found.unit != "s":
+        raise ValueError(f"gaps: must be over time, not over values in {found.unit}: give udk.gaps(mechanism, run=solution)")
+    least = {"t": found.least.value, "least": float(found.least.distance), "words": found.summary()}
+    record["gaps"] = least | outlines(found, mechanism.body_names)
+    events = [{"t": least["t"], "name": least["words"]}]
+    for pair, begins, ceases in found.contacts:
+        events += [{"t": t, "name": f"{' and '.join(pair)} {word}"} for t, word in ((begins, "touch"), (ceases, "part"))]
+    record["events"] = sorted([*record["events"], *events], key=lambda event: event["t"])
+
+
+def outlines(found: LeastGaps, bodies: Sequence[str], frames: Mapping[str, np.ndarray] | None = None) -> JsonObject:
+    """Return the `parts` of links, {body, points, radius}, and `pairs` of links as lists of the numbers of their parts.
+
+    Args:
+        found: the gaps.
+        bodies: names of the bodies by number; any other name is the ground, -1.
+        frames: x, y, angle (m, m, rad) of the frame of each body in which its points are given; by default its own frame.
+    """
+    parts, number = [], {name: k for k, name in enumerate(bodies)}
+    for part in found.parts:
+        x, y, angle = (0.0, 0.0, 0.0) if frames is None or part.body not in frames else map(float, frames[part.body])
+        turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+        points = (np.asarray(part.corners, float) @ turn + [x, y]).tolist()
+        parts.append({"body": number.get(part.body, -1), "points": points, "radius": float(part.radius)})
+    of = {name: [k for k, part in enumerate(found.parts) if part.body == name] for pair in found.pairs for name in pair.pair}
+    return {"parts": parts, "pairs": [[of[one], of[other]] for one, other in (gap.pair for gap in found.pairs)]}
