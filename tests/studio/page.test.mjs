@@ -449,6 +449,18 @@ test("every element has symbols that name it, and strange ones have none", () =>
   for (const {points = [], frame} of symbolsOf(strange, 1e-3)) assert.ok([...points.flat(), ...frame.flat()].every(Number.isFinite));
 });
 
+test("outlines are drawn with their holes, those of files once the server has read them", () => {
+  const corners = [[0, 0], [20, 0], [20, 20], [0, 20]], hole = [[5, 5], [8, 5], [8, 8]], units = {length: "mm"}, file = {file: "link.dxf", pin: 8};
+  const drawn = outline => symbolsOf({format: 2, units, pins: {A: [1, 1]}, link: [{name: "x", pins: ["A"], ...outline}]}, 1e-3).filter(({of, closed}) => of.kind === "link" && closed);
+  const here = drawn({outline: corners, holes: [hole]}), metres = points => points.map(([x, y]) => [1e-3 * x, 1e-3 * y]);
+  assert.deepEqual(here.map(({points, fill}) => [points.length, fill]), [[4, "edge:0"], [4, "tint:0"], [3, "back"]]);
+  assert.ok(here[2].points.flat().every((x, k) => Math.abs(x - 1e-3 * hole.flat()[k]) < 1e-15));
+  assert.equal(drawn({outline: file}).length, 0);
+  shapes.keepOutlines([{file, outline: metres(corners), holes: [metres(hole)]}]);
+  assert.deepEqual(drawn({outline: file}), here);
+  for (const holes of [3, [3], ["x"], [[["a", 1]]]]) assert.doesNotThrow(() => drawn({outline: corners, holes}));
+});
+
 test("a view deep inside a drawing, or of extremely far places, costs nothing", () => {
   const document = {...fourBar(), slide: [{link: "link3", direction: 0}]};
   assert.ok(symbolsOf(document, 1e-12).length < 500);

@@ -219,14 +219,18 @@ def test_unknown_templates_are_refused(client):
 
 
 @pytest.mark.slow
-def test_a_task_that_takes_too_long_is_stopped_and_the_next_is_served():
-    worker = Worker()
+def test_a_task_that_takes_too_long_is_stopped_and_the_next_is_served(tmp_path):
+    worker = Worker(tmp_path)
     try:
         with pytest.raises(RefusedError, match="longer than"):
             worker.call("list_templates", {}, 0.001)  # less than the imports take
         assert worker.call("list_templates", {}, 60.0)["templates"]
         with pytest.raises(RefusedError, match="no template"):
             worker.call("open_template", {"name": "nothing"}, 60.0)
+        outline = '[[link]]\nname = "arm"\nmass = 1\npins = ["A"]\noutline = "arm.dxf"'
+        text = f'format = 2\nground = ["A"]\n[pins]\nA = [0, 0]\n{outline}\n'
+        (tmp_path / "arm.dxf").write_text("")  # found in the folder of the studio, and no outline
+        assert "No such file" not in worker.call("compile_drawing", {"text": text}, 60.0)["problems"][0]
     finally:
         worker.close()
 

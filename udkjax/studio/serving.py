@@ -34,7 +34,7 @@ def serve(root: Path, opened: str = "", port: int = 0, browse: bool = True, say:
         say: function that shows the address to the user.
     """
     token = secrets.token_urlsafe(TOKEN_BYTES)
-    workers = Worker(), WorkerPool(COMPILERS), Worker()
+    workers = Worker(root), WorkerPool(COMPILERS, root), Worker(root)
     with closing(socket.socket(socket.AF_INET, socket.SOCK_STREAM)) as listener:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listener.bind((LOOPBACK, port))

@@ -14,6 +14,7 @@ from udkjax.positions.answers.counting import Count
 from udkjax.requirements import ArgumentError
 from udkjax.scene import library
 from udkjax.scene.drawing import Drawing
+from udkjax.scene.drawing.drawn_quantities import Units
 from udkjax.scene.files import loads
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.tables.checks import SceneError
@@ -78,9 +79,29 @@ def open_text(text: str) -> JsonObject:
         if document.get("format") == 1:
             drawn = drawing_text_of(loads(text))
             document = read_document(drawn)
+        else:
+            text, document = _named_pins(text, document)
+            drawn = text
     except SceneError as error:
         return {"text": text, "document": None, "problems": list(error.problems), "drawn": False}
     return {"text": drawn, "document": document, "problems": problems, "drawn": drawn != text}
+
+
+def _named_pins(text: str, document: JsonObject) -> tuple[str, JsonObject]:
+    """Return the text and the tables of a drawing whose links name the pins that they have at the holes of files."""
+    links, pins = document.get("link"), document.get("pins", {})
+    if not isinstance(links, list) or all("pins" in link for link in links if isinstance(link, dict)):
+        return text, document
+    try:
+        drawing = loads(text).drawing
+    except (SceneError, ArgumentError):  # reported when it is compiled
+        return text, document
+    assert isinstance(drawing, Drawing)
+    units, places = Units.of(drawing), {name: np.asarray(place, float).tolist() for name, place in drawing.pins.items()}
+    new = {name: [units.write(x, "m") for x in place] for name, place in places.items() if name not in pins}
+    named = [{"pins": list(link.pins), **given} for given, link in zip(links, drawing.links.values(), strict=True)]
+    text = merge_document(text, {**document, "pins": pins | new, "link": named})
+    return text, read_document(text)
 
 
 def compile_drawing(text: str = "", document: Mapping[str, Any] | None = None, engine: str = "") -> JsonObject:
@@ -112,7 +133,18 @@ def compile_drawing(text: str = "", document: Mapping[str, Any] | None = None, e
     engine_data = engine_of(mechanism, tables) if engine == "wasm" else {}
     if engine == "recorded":
         engine_data = {"motion": recorded_motion(mechanism)}
-    return {"text": text, "document": tables, "problems": [], "scene": scene_of(mechanism), **engine_data}
+    found = {"text": text, "document": tables, "problems": [], "scene": scene_of(mechanism), **engine_data}
+    return found | {"outlines": outlines_of_files(mechanism.drawing, tables)}
+
+
+def outlines_of_files(drawing: Drawing, document: JsonObject) -> list[JsonObject]:
+    """Return the outlines that links take from files: the `file` as it is named, and corners of `outline` and `holes` (m)."""
+    found = []
+    for link, given in zip(drawing.links.values(), document.get("link", []), strict=True):
+        if not isinstance(given.get("outline", []), list):
+            holes = [] if link.holes is None else np.asarray(link.holes).tolist()
+            found.append({"file": given["outline"], "outline": np.asarray(link.outline).tolist(), "holes": holes})
+    return found
 
 
 def engine_of(mechanism: Mechanism, document: JsonObject) -> JsonObject:

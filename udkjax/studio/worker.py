@@ -6,11 +6,13 @@ nothing from a scene is ever unpickled.
 
 import json
 import multiprocessing
+import os
 import threading
 import traceback
 from collections.abc import Callable, Mapping
 from importlib import import_module
 from multiprocessing.connection import Connection
+from pathlib import Path
 from typing import Any
 
 from udkjax.studio.limits import RefusedError
@@ -20,10 +22,14 @@ END_SECONDS = 5.0  # time to wait for a killed process
 
 
 class Worker:
-    """Runs the functions of `tasks.py` one at a time in a separate process, which is replaced if a function takes too long."""
+    """Runs the functions of `tasks.py` one at a time in a separate process, which is replaced if a function takes too long.
 
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
+    Args:
+        folder: the folder in which it runs, where drawings name files of outlines.
+    """
+
+    def __init__(self, folder: Path | None = None) -> None:
+        self._folder, self._lock = folder, threading.Lock()
         self._process: Any = None
         self._connection: Connection | None = None
 
@@ -63,7 +69,7 @@ class Worker:
             self._stop()
             context = multiprocessing.get_context("spawn")
             self._connection, child_end = context.Pipe()
-            self._process = context.Process(target=_serve, args=(child_end,), daemon=True, name="udkjax studio")
+            self._process = context.Process(target=_serve, args=(child_end, self._folder), daemon=True, name="udkjax studio")
             self._process.start()
             child_end.close()
         return self._connection
@@ -82,10 +88,11 @@ class WorkerPool:
 
     Args:
         count: number of workers; only the first starts before it is needed.
+        folder: the folder in which they run.
     """
 
-    def __init__(self, count: int):
-        self.workers = [Worker() for _ in range(count)]
+    def __init__(self, count: int, folder: Path | None = None):
+        self.workers = [Worker(folder) for _ in range(count)]
 
     def start(self) -> None:
         """Start the first process."""
@@ -100,8 +107,10 @@ class WorkerPool:
             worker.close()
 
 
-def _serve(connection: Connection) -> None:
+def _serve(connection: Connection, folder: Path | None) -> None:
     """Answer requests until the connection is closed."""
+    if folder is not None:
+        os.chdir(folder)
     tasks = import_module(TASKS)
     while True:
         try:

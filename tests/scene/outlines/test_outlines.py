@@ -212,3 +212,86 @@ def test_mistakes_of_named_outlines_are_listed(tmp_path):
     }.items():
         with pytest.raises(udk.SceneError, match=message):
             scene_with(tmp_path, arm)
+
+
+FROM_FILES = """format = 2
+units = {length = "mm"}
+numbers = {d = 110}
+ground = ["O", "C"]
+motor = [{pin = "O", speed = "60 rpm"}]
+link = [
+  {name = "crank", outline = "crank.dxf", density = 7850, thickness = 5},
+  {name = "coupler", outline = {file = "coupler.dxf", pin = 8}, density = 7850, thickness = 5},
+  {name = "rocker", outline = "rocker.dxf", density = 7850, thickness = 5},
+]
+[pins]
+O = [0, 0]
+C = ["d", 0]
+"""
+
+
+def four_bar_of_files(tmp_path, text=FROM_FILES, shift=0.0):
+    """A four-bar whose links are drawn where they are, the coupler with a third hole of another size."""
+    for name, (a, b), more in (
+        ("crank", ((0, 0), (30, 40)), []),
+        ("coupler", ((30 + shift, 40), (140, 90)), [((85, 65), 6)]),
+        ("rocker", ((140, 90), (110, 0)), []),
+    ):
+        file, space = document()
+        middle, (dx, dy) = np.mean([a, b], axis=0), np.subtract(b, a)
+        add_slot(space, float(np.hypot(dx, dy)), 9.0, tuple(middle), float(np.arctan2(dy, dx)), True, None)
+        for place, radius in [(a, 4), (b, 4), *more]:
+            space.add_circle(place, radius)
+        file.saveas(tmp_path / f"{name}.dxf")
+    (tmp_path / "scene.toml").write_text(text)
+    return udk.load(tmp_path / "scene.toml")
+
+
+def test_round_holes_of_files_are_pins_by_position(tmp_path):
+    mech = four_bar_of_files(tmp_path)
+    links = mech.drawing.links
+    assert [link.pins for link in links.values()] == [("O", "crank2"), ("crank2", "coupler2"), ("C", "coupler2")]
+    assert {name: np.asarray(place).round(12).tolist() for name, place in mech.drawing.pins.items()} == {
+        "O": [0, 0], "C": [0.11, 0], "crank2": [0.03, 0.04], "coupler2": [0.14, 0.09]
+    }  # fmt: skip
+    found = udk.characteristics(mech)
+    assert found.turns and [len(link.holes) for link in links.values()] == [2, 3, 2]
+    every = four_bar_of_files(tmp_path, FROM_FILES.replace('{file = "coupler.dxf", pin = 8}', '"coupler.dxf"'))
+    assert every.drawing.links["coupler"].pins == ("crank2", "coupler2", "coupler3")
+    named = four_bar_of_files(tmp_path, FROM_FILES.replace('name = "rocker", ', 'name = "rocker", pins = ["C", "coupler2"], '))
+    assert named.drawing.links["rocker"].pins == ("C", "coupler2")
+
+
+def test_mistakes_of_pins_at_holes_are_named(tmp_path):
+    lengths = '\nB = {from = ["O", "C"], length = [50, 90], side = "left"}\n'
+    for old, new, message in (
+        ("pin = 8", "pin = 9", r'"coupler".outline: no round hole for a pin of diameter 9 mm; there are holes of 8 mm, 12 mm'),
+        ("pin = 8", "pin = -8", r"outline.pin: must be a positive length, not -8"),
+        ("d = 110", "d = 110.5", r'"rocker".outline: pin "C" is 0.5 mm off the centre of its hole, \[110, 0\] mm: move one'),
+        ('C = ["d", 0]', 'C = ["d", 0]' + lengths, "found by coordinates, which B has not: name the pins of the link"),
+    ):
+        with pytest.raises(udk.SceneError, match=message):
+            four_bar_of_files(tmp_path, FROM_FILES.replace(old, new))
+    with pytest.raises(udk.SceneError, match=r'pin "crank2" is 1 mm off the centre of its hole, \[31, 40\] mm'):
+        four_bar_of_files(tmp_path, shift=1.0)
+
+
+def test_the_studio_names_pins_at_holes_and_draws_the_outlines(tmp_path, monkeypatch):
+    pytest.importorskip("tomlkit")
+    from udkjax.studio import tasks
+
+    drawing = four_bar_of_files(tmp_path).drawing
+    monkeypatch.chdir(tmp_path)
+    opened = tasks.open_text(FROM_FILES)
+    assert opened["document"]["pins"] == {"O": [0, 0], "C": ["d", 0], "crank2": [30.0, 40.0], "coupler2": [140.0, 90.0]}
+    assert [link["pins"] for link in opened["document"]["link"]] == [list(link.pins) for link in drawing.links.values()]
+    assert opened["document"]["link"][0]["outline"] == "crank.dxf" and not opened["drawn"]
+    compiled = tasks.compile_drawing(opened["text"])
+    assert compiled["problems"] == [] and compiled["text"] == opened["text"]
+    assert [shape["file"] for shape in compiled["outlines"]] == [link["outline"] for link in opened["document"]["link"]]
+    for shape, link in zip(compiled["outlines"], drawing.links.values(), strict=True):
+        np.testing.assert_array_equal(shape["outline"], link.outline)
+        np.testing.assert_array_equal(shape["holes"], link.holes)
+    (tmp_path / "crank.dxf").unlink()
+    assert tasks.open_text(FROM_FILES)["text"] == FROM_FILES
+    assert "No such file" in tasks.compile_drawing(FROM_FILES)["problems"][0]

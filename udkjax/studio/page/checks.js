@@ -2,7 +2,7 @@
 
 import {LISTS} from "./document.js";
 
-const TABLES = ["pins", "units", "velocities"], NAMES = ["pins", "along", "between", "links", "of"], NUMBERS = ["teeth", "radii", "force", "outline", "centre"];
+const TABLES = ["pins", "units", "velocities"], NAMES = ["pins", "along", "between", "links", "of"], NUMBERS = ["teeth", "radii", "force", "centre"];
 
 const isTable = value => typeof value === "object" && value !== null && !Array.isArray(value);
 const isNames = value => Array.isArray(value) && value.every(name => typeof name === "string");
@@ -28,6 +28,7 @@ function entryProblem(section, entry) {
   if (section === "link" && !("pins" in entry)) return "pins: missing; a link needs a list of pins, such as [\"A\", \"B\"]";
   const names = NAMES.find(key => key in entry && !isNames(entry[key])), numbers = NUMBERS.find(key => key in entry && !Array.isArray(entry[key]));
   if (names) return `${names}: must be a list of names, such as A, B`;
+  if ("outline" in entry && !Array.isArray(entry.outline) && typeof entry.outline !== "string" && !isTable(entry.outline)) return "outline: must be a list of corners, or the name of a DXF or SVG file";
   if (numbers) return `${numbers}: must be a list, such as [1, 2]`;
   if (!("profile" in entry)) return "";
   const isProfile = isTable(entry.profile) && ["angle", "radius", "law", "lift", "swing"].every(key => !(key in entry.profile) || Array.isArray(entry.profile[key]));

@@ -78,6 +78,7 @@ class Draft {
     for (const [width, colour] of [[11, edge(k)], [8, tint(k)]]) {
       this[layer].push({...line([k, 0, 0, 0, 1], shape.points, colour, width, closed ? colour : "", closed), of});
     }
+    for (const hole of shape.holes ?? []) this[layer].push({...line([k, 0, 0, 0, 1], hole, edge(k), 1.3, "back", true), of});
   }
 
   pin(name) {

@@ -39,13 +39,25 @@ export function area(points) {
   return Math.abs(sum) / 2;
 }
 
-/** The shape of a link: {kind: "line" or "plate", points} through its pins or outline, or {kind: "disc", at, radius}. */
+const files = new Map();  // outlines and holes (m) of the files that links name
+
+/** Keep the outlines that the server has read from files, {file, outline, holes}. */
+export function keepOutlines(found) { for (const {file, ...shape} of found) files.set(JSON.stringify(file), shape); }
+
+/** The outline of a link and its holes, as lists of corners (m); null without an outline. */
+function outlineOf(document, {outline, holes = []}) {
+  if (outline === undefined) return null;
+  if (!Array.isArray(outline)) return files.get(JSON.stringify(outline)) ?? null;
+  const corners = points => (Array.isArray(points) ? points : [null]).map(p => [length(p?.[0], document), length(p?.[1], document)]);
+  const found = {outline: corners(outline), holes: Array.isArray(holes) ? holes.map(corners) : []};
+  return [found.outline, ...found.holes].every(points => points.every(p => p.every(Number.isFinite))) ? found : null;
+}
+
+/** The shape of a link: {kind: "line" or "plate", points, holes} through its pins or outline, or {kind: "disc", at, radius}. */
 export function linkShape(document, link) {
   const places = (link.pins ?? []).map(pin => placeOf(document, pin)).filter(Boolean);
-  if (Array.isArray(link.outline)) {
-    const outline = link.outline.map(p => [length(p?.[0], document), length(p?.[1], document)]);
-    if (outline.every(p => p.every(Number.isFinite))) return {kind: "plate", points: outline};
-  }
+  const drawn = outlineOf(document, link);
+  if (drawn) return {kind: "plate", points: drawn.outline, holes: drawn.holes};
   if (!places.length) return null;
   if (places.length === 1) {
     const centre = Array.isArray(link.centre) ? point(link.centre, document) : null;

@@ -3,6 +3,7 @@
 import {RequestError, ask} from "./api.js";
 import {PageEngine} from "./page_engine.js";
 import {loadEngine} from "./player/engine.js";
+import {keepOutlines} from "./shapes.js";
 
 const COMPILE_DELAY = 120;  // ms without a change before an engine is compiled, which takes the server half a second or more
 const MOST_ENGINES = 12;  // of former structures, so that undo need not wait for the server
@@ -52,6 +53,11 @@ export class Sync {
     studio.source.show();
     studio.files.showTitle();
     studio.findings.showProblems(found.problems);
+    if (found.outlines?.length) {
+      keepOutlines(found.outlines);
+      studio.canvas.drawn = [];  // the symbols follow from them
+      studio.redraw();
+    }
     if (found.problems.length) {
       studio.answers.clear();
       this.structure = null;
