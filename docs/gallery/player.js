@@ -664,6 +664,40 @@ function followPointers(player, canvas, liveRun) {
     player.draw();
   }, {passive: false});
 }
+const OPACITY = 0.4;
+const side = ([ax, ay], [bx, by], [x, y]) => Math.sign((bx - ax) * (y - ay) - (by - ay) * (x - ax));
+const edges = points => points.map((point, k) => [point, points[(k + 1) % points.length]]);
+const cross = ([a, b], [c, d]) => side(a, b, c) * side(a, b, d) < 0 && side(c, d, a) * side(c, d, b) < 0;
+/** True if two convex outlines, lines or points overlap or are closer to each other than `reach`. */
+function touch(one, other, reach) {
+  const holds = (outline, point) => isNear(point, outline.length > 1 ? outline : [outline[0], outline[0]], outline.length > 2, reach);
+  return one.some(point => holds(other, point)) || other.some(point => holds(one, point))
+    || edges(one).some(edge => edges(other).some(another => cross(edge, another)));
+}
+/** Paint the links that touch in the pose of a painter; `parts` and `pairs` are described in gap_records.py. Returns their parts. */
+function paintTouching(painter, {parts, pairs}) {
+  const {scale} = painter.view, {context, theme} = painter, found = new Set();
+  const places = parts.map(({body, points}) => points.map(([x, y]) => painter.anchor([body, x, y])));
+  for (const pair of pairs) {
+    const [one, other] = pair;
+    if (one.some(i => other.some(j => touch(places[i], places[j], scale * (parts[i].radius + parts[j].radius))))) pair.flat().forEach(k => found.add(k));
+  }
+  context.globalAlpha = OPACITY;
+  for (const k of found) {
+    const points = places[k].length > 1 ? places[k] : [places[k][0], places[k][0]];
+    painter.line(points, 2 * scale * parts[k].radius / painter.pt, theme.force, {closed: true, fill: points.length > 2 ? theme.force : null});
+  }
+  context.globalAlpha = 1;
+  return found;
+}
+/** The button of a player that leads to the least gap of its runs, and its key. */
+class GapMarks {
+  constructor(player) {
+    const [least] = player.runs.map(run => run.gaps).filter(Boolean).sort((a, b) => a.least - b.least);
+    this.show = () => { player.pause(); player.seek(least.t); };
+    this.button = button("Least gap", `go to the least gap: ${least.words} (G)`, this.show);
+  }
+}
 /** The conditions at a state, with their rates, the effect of impulses along them, and their scales: the change of each by a
  *  displacement of one length or a turn of one radian, which never becomes smaller than in `before`. */
 function evaluate(engine, numbers, settings, state, before) {
@@ -1670,15 +1704,16 @@ class Player {
     if (this.runs.some(run => run.traces.length)) this.buttons.traces = toggle("traces", "Traces", "T");
     if (this.runs.some(run => run.reactions)) this.buttons.reactions = toggle("reactions", "Reactions", "R");
     this.buttons.names = toggle("names", "Names", "N");
+    this.gaps = this.runs.some(run => run.gaps) ? new GapMarks(this) : null;
     this.panels = this.runs.map((run, k) => this.panel(run, k));
     this.stage = make("div", {class: "stage"}, ...this.panels.map(p => p.figure));
     this.live = data.live ? new Live(this, data) : null;
     const middle = this.live ? make("div", {class: "middle"}, this.stage, this.live.panel.element) : this.stage;
     this.help = make("div", {class: "help", hidden: "", onclick: () => this.toggleHelp()},
-      make("dl", {}, ...[...HELP, ...(data.live ? LIVE_HELP : [])].flatMap(([key, words]) => [make("dt", {}, key), make("dd", {}, words)])));
+      make("dl", {}, ...[...HELP, ...(data.live ? LIVE_HELP : []), ...(this.gaps ? [["G", "least gap"]] : [])].flatMap(([key, words]) => [make("dt", {}, key), make("dd", {}, words)])));
     this.eventMarks = new EventMarks(this);
     const groups = [this.playButton, this.timeLabel, this.eventMarks.element, make("div", {class: "group"}, ...(this.modes ? [] : [this.speedSelect]),
-      ...Object.entries(this.buttons).filter(([name]) => name !== "ghost").map(([, button]) => button))];
+      ...Object.entries(this.buttons).filter(([name]) => name !== "ghost").map(([, button]) => button), ...(this.gaps ? [this.gaps.button] : []))];
     if (this.modes) {
       const range = make("input", {type: "range", min: 0, max: 3, step: 0.01, value: 1, "aria-label": "amplitude",
         oninput: () => { this.amplitude = +range.value; this.draw(); }});
@@ -1823,7 +1858,7 @@ class Player {
       Home: () => this.seek(start), End: () => this.seek(end), 0: () => this.whole(), "?": () => this.toggleHelp(),
       "+": () => this.setSpeed(speeds[Math.min(at + 1, speeds.length - 1)]), "-": () => this.setSpeed(speeds[Math.max(at - 1, 0)]),
       t: () => this.toggle("traces"), n: () => this.toggle("names"), r: () => this.toggle("reactions"), l: () => this.toggle("loop"),
-      d: () => this.switchTheme(), ...(this.live?.keys() ?? {}), Escape: () => { this.help.hidden = true; },
+      d: () => this.switchTheme(), ...(this.live?.keys() ?? {}), ...(this.gaps ? {g: this.gaps.show} : {}), Escape: () => { this.help.hidden = true; },
     };
     const action = actions[event.key] ?? actions[event.key.toLowerCase()];
     if (!action || (event.key === " " && ["BUTTON", "SUMMARY"].includes(target.tagName))) return;  // a button takes the space bar itself
@@ -1868,6 +1903,7 @@ class Player {
       if (show.traces && !run.mode) painter.traces(run, t);
       painter.pose = run.pose(t, this.amplitude);
       painter.draw(run.symbols);
+      if (run.gaps) paintTouching(painter, run.gaps);
       painter.sticking(run, t);
       live?.paintHand(painter);
       if (show.reactions && run.reactions) painter.reactions(run, t, width, height);

@@ -47,6 +47,7 @@ GROUPS = {
         "neural_friction": ("Friction learned by a network", "compare the learned law with the true one"),
     },
     "Design": {
+        "workshop_four_bar": ("Four-bar for the workshop", "press Least gap: crank and rocker of the nearest four-bar turn red"),
         "designed_paths": ("Paths by design", "follow the foot, which stays level on the ground"),
         "drawn_curves": ("Letters and a star", "count the teeth of the star while its second crank turns"),
         "six_bar_dwell": ("Six-bar with a dwell", "watch the output rest for a third of a turn"),

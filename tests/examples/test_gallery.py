@@ -29,6 +29,7 @@ FACTS = {  # of each example, what must be true of the numbers that it prints
     "identification": lambda off, *_: off < 3,
     "double_pendulum_map": lambda members, over, calm, failed: members == 2500 and over > 0.1 and calm == 0 and failed == 0,
     "neural_friction": lambda after, before, law: after < 0.1 * before and law < 0.4,
+    "workshop_four_bar": lambda before, hit, after, gap: before < 80 and hit < -4 and after > 99 and gap > 2.5,
     "designed_paths": lambda line, letter, foot: line < 0.1 and letter < 2 and foot < 1,
     "drawn_curves": lambda *errors: len(errors) == 4 and max(errors) < 0.03,
     "six_bar_dwell": lambda swing, rest: 29 < swing < 36 and rest < 0.5,

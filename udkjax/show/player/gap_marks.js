@@ -37,6 +37,6 @@ export class GapMarks {
   constructor(player) {
     const [least] = player.runs.map(run => run.gaps).filter(Boolean).sort((a, b) => a.least - b.least);
     this.show = () => { player.pause(); player.seek(least.t); };
-    this.button = button("Least gap", `${least.words} (G)`, this.show);
+    this.button = button("Least gap", `go to the least gap: ${least.words} (G)`, this.show);
   }
 }
