@@ -43,9 +43,13 @@ def test_a_drawn_path_becomes_a_mechanism(studio):
 @pytest.mark.slow
 def test_a_wanted_path_is_read_from_a_table(studio):
     file = studio.folder / "path.csv"
-    file.write_text("x,y,remark\n10,20,a\n30,40,b\n50,20,c\n")
+    file.write_text("time;x;y\n0;10;20\n1;30;40,5\n2;50\n")
+    studio.page.get_by_label("table of a wanted path").set_input_files(str(file))
+    studio.page.get_by_text("line 4 of path.csv must be two numbers x, y").wait_for()
+    studio.problems[:] = [words for words in studio.problems if "400" not in words]
+    file.write_text("time;x;y\n0;10;20\n1;30;40,5\n2;50;20\n")
     studio.page.get_by_label("table of a wanted path").set_input_files(str(file))
     studio.until("studio.wanted.points?.length === 3")
-    np.testing.assert_allclose(studio.js("studio.wanted.points"), [[0.01, 0.02], [0.03, 0.04], [0.05, 0.02]])
+    np.testing.assert_allclose(studio.js("studio.wanted.points"), [[0.01, 0.02], [0.03, 0.0405], [0.05, 0.02]])
     studio.page.get_by_role("button", name="remove the wanted path").click()
     assert studio.js("studio.wanted.points") is None

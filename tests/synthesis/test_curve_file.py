@@ -6,7 +6,18 @@ import pytest
 from udkjax.synthesis.curves.curve_file import read_curve_file
 
 
-@pytest.mark.parametrize("text", ["x,y\n0,0\n1,2\n3,1\n", "0 0\n1 2\n3 1", "# x; y\n0;0;7\n1;2;8\n3;1;9\n", "0,0\n1,2\n\n3,1\n"])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "x,y\n0,0\n1,2\n3,1\n",
+        "0 0\n1 2\n3 1",
+        "# x; y\n0;0;7\n1;2;8\n3;1;9\n",
+        "0,0,\n1,2,\n\n3,1,\n",
+        "# a curve\nt [s],Y [m],X [m]\n0,0,0\n1,2,1\n# its end\n2,1,3\n",
+        '"x"\t"y"\nmm\tmm\n"0"\t"0"\n"1"\t"2"\n"3"\t"1"',
+        "x;y\n0,0;0\n1,0;2,0\n3;1,0",
+    ],
+)
 def test_rows_of_a_table(tmp_path, text):
     file = tmp_path / "curve.csv"
     file.write_text(text)
@@ -15,7 +26,13 @@ def test_rows_of_a_table(tmp_path, text):
 
 @pytest.mark.parametrize(
     ("text", "message"),
-    [("", "no rows"), ("x,y\n1,2\n3,four\n", "line 3"), ("1\n2\n3\n", "line 2|no rows"), ("a\nb\nc", "line 2")],
+    [
+        ("", "no rows"),
+        ("x,y\n1,2\n3,four\n", "line 3"),
+        ("1\n2\n3\n", "line 1"),
+        ("a\nb\nc", "no rows"),
+        ("1,2,3\n", "a heading must name"),
+    ],
 )
 def test_tables_with_mistakes(tmp_path, text, message):
     file = tmp_path / "curve.csv"
@@ -51,6 +68,14 @@ def test_drawings_with_mistakes(tmp_path, content, message):
     file.write_text(content)
     with pytest.raises(ValueError, match=message):
         read_curve_file(file)
+
+
+def test_a_closed_shape_is_one_stroke(tmp_path):
+    file = tmp_path / "curve.svg"
+    file.write_text('<svg width="9mm" height="9mm" viewBox="0 0 10 10"><circle cx="5" cy="5" r="3"/></svg>')
+    points = read_curve_file(file)
+    np.testing.assert_allclose(np.linalg.norm(points - [4.5, -4.5], axis=1), 2.7, rtol=1e-9)
+    np.testing.assert_allclose(points[0], points[-1], atol=1e-9)
 
 
 def test_a_drawing_with_a_transform_and_a_unit(tmp_path):

@@ -96,7 +96,7 @@ def test_a_file_gives_a_curve_in_its_unit(tmp_path):
     np.testing.assert_allclose(goal.points, CORNER)
     assert not goal.is_whole and goal.extras == 1
     (tmp_path / "goal.toml").write_text(text.replace("curve.csv", "bar.toml"), encoding="utf-8")
-    with pytest.raises(udk.SceneError, match=r"goal.points: line 2 of bar.toml must be two numbers"):
+    with pytest.raises(udk.SceneError, match=r"goal.points: line 1 of bar.toml must be two numbers"):
         read_design(tmp_path / "goal.toml")
 
 

@@ -62,6 +62,11 @@ def design(
     for name, value, minimum in (("starts", starts, 1), ("results", results, 1), ("seed", seed, 0)):
         if value < minimum:
             refuse(f"--{name} {value}: must be at least {minimum}")
+    if out is not None:
+        try:
+            out.mkdir(parents=True, exist_ok=True)
+        except OSError as problem:
+            refuse(f"cannot write --out {out}: {problem}")
     if goal is None and curve is not None:
         given = {"bars": bars, "seed": seed, "results": results, "seconds": seconds, "geared": geared, "slides": slides}
         _show_curve(curve, given, size, unit, out, json)
@@ -121,14 +126,16 @@ def _show_curve(file: Path, options: dict[str, Any], size: float | None, unit: s
     metres = Units.sizes("m")[unit]
     try:
         points = metres * read_curve_file(file)
-        limits = {"size": None if size is None else metres * size}
-        found = udk.mechanisms_for(points, unit=unit, **limits, **options)
     except (OSError, UnicodeDecodeError) as problem:
         refuse(f"cannot read {file}: {problem}")
     except ValueError as problem:
-        refuse(f"{file}: {problem}")
+        refuse(str(problem))
+    options["size"] = None if size is None else metres * size
+    try:
+        found = udk.mechanisms_for(points, unit=unit, **options)
+    except ValueError as problem:
+        refuse(f"--{problem}" if str(problem).split()[0] in options else f"{file}: {problem}")
     if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
         for k, candidate in enumerate(found):
             udk.save(candidate.mechanism, out / f"design{k + 1}.toml")
             _moving_page(candidate, [candidate.pin], points).save(out / f"design{k + 1}.html")
@@ -195,7 +202,6 @@ def _write(designs: Iterable[Any], goal: Any, out: Path) -> str:
     """Write each design as a drawing and as a page; return the folder."""
     import udkjax as udk
 
-    out.mkdir(parents=True, exist_ok=True)
     for k, candidate in enumerate(designs):
         udk.save(candidate.mechanism, out / f"design{k + 1}.toml")
         _page(candidate, goal).save(out / f"design{k + 1}.html")

@@ -6,6 +6,7 @@
     POST /api/compile     {text, document?, engine?}                  -> {text, document, problems, scene, engine}
     POST /api/diagnose    {text, about?, end?}                        -> findings about the drawing
     POST /api/design      {path, unit?, seed?}                        -> mechanisms with a point on a wanted path
+                          {table, name, unit?}                        -> {path} of a table's text
 
 A refused request is answered by {problem} and an HTTP status.
 """
@@ -95,8 +96,11 @@ class Studio:
         return self.examiner.call("diagnose_drawing", given, DIAGNOSE_SECONDS)
 
     def design(self, request: JsonObject) -> JsonObject:
-        """Return mechanisms with a pin that draws a wanted path."""
+        """Return mechanisms with a pin that draws a wanted path, or the path of a table."""
         path, unit, seed = request.get("path"), request.get("unit", "mm"), request.get("seed", 0)
+        if "table" in request and unit in Units.sizes("m"):
+            given = {"text": require_size(request["table"]), "name": str(request.get("name", "the table")), "unit": unit}
+            return self.reader.call("read_path", given, COMPILE_SECONDS)
         if not isinstance(path, list) or unit not in Units.sizes("m") or type(seed) is not int or seed < 0:
             raise RefusedError(400, "path: must be a list of places [x, y] in m; unit: a unit of lengths; seed: a natural number")
         return self.examiner.call("find_path", {"path": path, "unit": unit, "seed": seed}, DIAGNOSE_SECONDS)

@@ -5,10 +5,12 @@ from typing import Any
 import numpy as np
 
 from udkjax.annotations import JsonObject
+from udkjax.scene.drawing.drawn_quantities import Units
 from udkjax.scene.files import dumps
 from udkjax.studio.limits import RefusedError
 from udkjax.studio.text_edits import merge_document, read_document
 from udkjax.synthesis.curves.curve_designs import CurveDesign
+from udkjax.synthesis.curves.curve_file import read_curve_table
 from udkjax.synthesis.curves.mechanisms_for import mechanisms_for
 
 # Largest number of bars, and CPU time (s), of the first search and the following ones: simple mechanisms appear at once.
@@ -48,6 +50,15 @@ def find_mechanisms(path: object, unit: str = "mm", seed: int = 0) -> JsonObject
         raise RefusedError(400, f"path: {problem}") from None
     designs = [_drawn(design, points) for design in found]
     return {"designs": sorted(designs, key=lambda one: one["deviation"]), "extent": extent, "reason": found.reason}
+
+
+def path_of_table(name: str, text: str, unit: str) -> list[list[float]]:
+    """Return the places [x, y] (m) of a table of a wanted path, with lengths in `unit`."""
+    try:
+        points = Units.sizes("m")[unit] * read_curve_table(name, text)
+    except ValueError as problem:
+        raise RefusedError(400, str(problem)) from None
+    return _points(points).tolist()
 
 
 def _points(path: object) -> np.ndarray:

@@ -249,6 +249,13 @@ def find_path(path: object, unit: str = "mm", seed: int = 0) -> JsonObject:
     return find_mechanisms(path, unit, seed)
 
 
+def read_path(name: str, text: str, unit: str) -> JsonObject:
+    """Return the wanted path of a table, with lengths in `unit`."""
+    from udkjax.studio.path_search import path_of_table
+
+    return {"path": path_of_table(name, text, unit)}
+
+
 def template_text(name: str) -> str:
     """Return a template as the text of a drawing."""
     if name in DRAWN:

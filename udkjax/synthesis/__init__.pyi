@@ -8,6 +8,7 @@ from udkjax.synthesis.curve_goal import CurveGoal as CurveGoal
 from udkjax.synthesis.curves.curve_designs import CurveDesign as CurveDesign
 from udkjax.synthesis.curves.curve_designs import CurveDesigns as CurveDesigns
 from udkjax.synthesis.curves.curve_file import read_curve_file as read_curve_file
+from udkjax.synthesis.curves.curve_file import read_curve_table as read_curve_table
 from udkjax.synthesis.curves.mechanisms_for import mechanisms_for as mechanisms_for
 from udkjax.synthesis.design import DesignSearch as DesignSearch
 from udkjax.synthesis.design import design as design

@@ -10,12 +10,6 @@ const ROUNDS = 4;  // searches, each with more bars; the first one answers withi
 const MOST = 8;  // mechanisms to look through
 const ALIKE = 1e-3;  // pins whose places differ by less, relative to the extent of the path, are the same
 
-/** The places of a table of two columns, x and y in the document's unit; null if it has none. Further columns and headings are left out. */
-export function placesOfTable(text, unit) {
-  const rows = text.split(/\r?\n/).map(line => line.trim().split(/[\s,;]+/).slice(0, 2).map(Number)).filter(row => row.length === 2 && row.every(Number.isFinite));
-  return rows.length >= FEWEST ? rows.map(row => row.map(x => x * unit)) : null;
-}
-
 const pinsText = ({pins}) => JSON.stringify(pins);
 const placesOf = ({document}) => Object.values(document.pins).flat().map(x => x * lengthUnit(document));
 
@@ -56,9 +50,14 @@ export class WantedPath {
 
   async read(file) {
     if (!file) return;
-    const {studio} = this, points = placesOfTable(await file.text(), lengthUnit(studio.document));
+    const {studio} = this;
     this.input.value = "";
-    if (!points) return void studio.say(`${file.name} has no two columns of numbers, x and y`, true);
+    let points;
+    try {
+      ({path: points} = await ask("design", {table: await file.text(), name: file.name, unit: lengthName(studio.document)}));
+    } catch (error) {
+      return void studio.say(error.message, true);
+    }
     this.stop();
     Object.assign(this, {points, designs: [], seed: 0});
     this.show();

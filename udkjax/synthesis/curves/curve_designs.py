@@ -127,7 +127,12 @@ def ranked(found: dict[int, list[FoundLinkage]], wanted: WantedCurve, count: int
         structure = b"".join(a.tobytes() for a in one.topology if a is not one.topology.side)
         if len(chosen) == count or any(s == structure and abs(e - one.error) < 0.02 * e for s, e in errors):
             continue
-        design = confirmed(one, wanted, f"curve {len(chosen) + 1}", unit)
+        try:
+            design = confirmed(one, wanted, f"curve {len(chosen) + 1}", unit)
+        except KeyboardInterrupt:  # the best so far
+            if chosen:
+                break
+            raise
         if design is not None:
             chosen.append(design)
             errors.append((structure, one.error))

@@ -62,10 +62,6 @@ class Kept(NamedTuple):
         return self.take(np.array(chosen, int))
 
 
-class OutOfTimeError(Exception):
-    """The time of a search is over."""
-
-
 class FoundLinkage(NamedTuple):
     """A linkage within the limits over the whole turn.
 
@@ -116,7 +112,7 @@ class CurveSearch:
         self.found: dict[int, list[FoundLinkage]] = {}
         self.turned: set[int] = set()  # numbers of bars of which a finished linkage was within the limits
         self.threads = ThreadPoolExecutor(thread_count())
-        self.until = np.inf  # CPU time (`time.process_time`) at which descents end with an `OutOfTimeError`
+        self.until = np.inf  # CPU time (`time.process_time`) after which descents end early
 
     def stages(self) -> Iterator[str]:
         """Run the search, without end; yield a description of each stage when it is completed.
@@ -152,14 +148,14 @@ class CurveSearch:
         return min(losses, default=np.inf) <= 2.0 * (np.hypot(error, blur) - blur)
 
     def finish(self, until: float = np.inf) -> None:
-        """Finish the best linkages, the most promising first, also of an incomplete round; after a time only until there is one.
+        """Finish the best linkages, also of an incomplete round; after a time only the most promising, until there is one.
 
         Of each number of bars, the next ones are tried while none was within the limits.
         """
         self._merge()
         order = sorted((n for n, kept in self.beams.items() if len(kept.x)), key=lambda n: self.beams[n].loss[0])
-        for bars in order:
-            while (time.process_time() < until or not self.found) and self._finish(bars):
+        for k, bars in enumerate(order):
+            while (k == 0 or time.process_time() < until or not self.found) and self._finish(bars):
                 pass
 
     def _start(self, beams: dict[int, Kept], bars: int, rng: np.random.Generator) -> None:
@@ -199,11 +195,10 @@ class CurveSearch:
 
     def _descend(self, x: np.ndarray, topology: Topology, task: Task, blur: float, steps: int) -> Descended:
         """Improve linkages in batches, on all threads."""
-        if time.process_time() > self.until:
-            raise OutOfTimeError
         self.candidates += len(x)
         batches = [slice(k, k + LANES) for k in range(0, len(x), LANES)]
-        results = list(self.threads.map(lambda part: descend(x[part], topology.take(part), task, blur, steps), batches))
+        given = task, blur, steps, self.until
+        results = list(self.threads.map(lambda part: descend(x[part], topology.take(part), *given), batches))
         return Descended(*(np.concatenate(a) for a in zip(*results, strict=True)))
 
     def _finish(self, bars: int) -> bool:
@@ -217,7 +212,8 @@ class CurveSearch:
         x = kept.x
         for blur, weight, steps in OF_FINISH:
             x = self._descend(x, kept.topology, self.exact.weighed(weight), blur, steps).x
-        self.finished.update(kept.loss)  # not if time was over in between
+        if time.process_time() < self.until:  # otherwise they are to be finished again
+            self.finished.update(kept.loss)
         for k in range(len(x)):
             one = self.verified(*without_idle_dyads(x[k], kept.topology.take(slice(k, k + 1))))
             if one is not None:

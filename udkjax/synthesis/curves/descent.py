@@ -3,6 +3,7 @@
 The gradient of `comparison` is exact; nearest places and weights are held within a step. Violations of limits are least squares.
 """
 
+import time
 from typing import NamedTuple
 
 import numpy as np
@@ -144,7 +145,7 @@ def evaluate(x: np.ndarray, topology: Topology, task: Task, blur: float) -> tupl
     return curve.distance + 0.5 * (excess**2).sum(1), curve.distance, excess.max(1) / limits.weight, A, b
 
 
-def descend(x: np.ndarray, topology: Topology, task: Task, blur: float, steps: int) -> Descended:
+def descend(x: np.ndarray, topology: Topology, task: Task, blur: float, steps: int, until: float = np.inf) -> Descended:
     """Improve linkages (K, numbers) by a number of steps, each on its own.
 
     Args:
@@ -153,12 +154,15 @@ def descend(x: np.ndarray, topology: Topology, task: Task, blur: float, steps: i
         task: the target.
         blur: distance (RMS radii) below which squares are minimized.
         steps: number of steps.
+        until: CPU time (`time.process_time`) after which it ends early.
     """
     low, high = task.limits.bounds(topology, task.sample.is_whole)
     x = np.clip(x, low, high)
     now = list(evaluate(x, topology, task, blur))
     damping, places = np.full(len(x), 1e-2), np.arange(x.shape[1])
     for _ in range(steps):
+        if time.process_time() > until:
+            break
         A, b = now[3].copy(), now[4]
         size = A[:, places, places]
         largest = size.max(1, keepdims=True)

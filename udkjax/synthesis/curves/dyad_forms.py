@@ -112,7 +112,7 @@ def balance(
     P, Q, R, turn1, turn2, one, two, cosine = dyads
     e1, e2, s = turn1[:, None], turn2[:, None], squeeze
     if form == PINS:
-        sine = one[:, None] * two[:, None] * cross(e1, e2)
+        sine = one[:, None] * two[:, None] * cross(e1, e2) + TINY
         a1, a2 = moment1 * two[:, None] / sine, moment2 * one[:, None] / sine
         g = a1 * e2 + a2 * e1
         by_one, by_two = -dot(g, e1), dot(g, e2)

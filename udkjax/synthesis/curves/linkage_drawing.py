@@ -1,5 +1,6 @@
 """A linkage of dyads as a drawing, and the check of its whole turn by the kinematics of the mechanism."""
 
+from itertools import count
 from string import ascii_uppercase
 from typing import Any
 
@@ -36,7 +37,7 @@ def pins_of_linkage(x: np.ndarray, topology: Topology) -> dict[str, list[LinkPoi
     pins: dict[str, list[LinkPoint]] = {"O": [(0, complex(x[0], x[1])), (1, 0j)]}
     if topology.ratio[0]:
         pins["O2"] = [(0, complex(x[SECOND], x[SECOND + 1])), (GEARED, 0j)]
-    names = iter([*LETTERS, *(f"{a}{k}" for k in range(1, 10) for a in LETTERS)])
+    names = (f"{a}{k or ''}" for k in count() for a in LETTERS)
     for d in range(topology.dyads):
         k, one, two = HEAD + EACH * d, BASE + 2 * d, BASE + 2 * d + 1
         form = int(topology.form[0, d])

@@ -12,7 +12,7 @@ from udkjax.requirements import require_choice
 from udkjax.scene.arguments import checked
 from udkjax.scene.drawing.drawn_quantities import Units
 from udkjax.synthesis.curves.curve_designs import CurveDesigns, ranked
-from udkjax.synthesis.curves.curve_search import FEWEST_BARS, CurveSearch, OutOfTimeError
+from udkjax.synthesis.curves.curve_search import FEWEST_BARS, CurveSearch
 from udkjax.synthesis.curves.descent import LinkageLimits
 from udkjax.synthesis.curves.targets import CHAMFER_POINTS, WantedCurve
 
@@ -111,8 +111,8 @@ def _run(
                     return done
                 if time.process_time() > search.until:
                     break
-    except (KeyboardInterrupt, OutOfTimeError):
-        pass
+    except KeyboardInterrupt:
+        seconds = 0.0  # only the most promising linkages are finished
     search.until = np.inf
     search.finish(begun + seconds)
     return done
