@@ -63,7 +63,7 @@ class Program:
         def compute(first: int) -> tuple[Outputs, Outputs]:
             return jax.tree.map(np.asarray, program(shared, _rows(own, first, self.size)))
 
-        each: Callable[..., Iterable] = _threads(os.getpid(), thread_count()).map if on_threads and count > self.size else map
+        each: Callable[..., Iterable] = member_threads().map if on_threads and count > self.size else map
         return jax.tree.map(lambda *x: np.concatenate(x)[:count], *each(compute, range(0, count, self.size)))
 
     def place(self, shared: T, own: PyTree) -> T:
@@ -149,9 +149,13 @@ def _rows(own: T, first: int, count: int) -> T:
     return jax.tree.map(lambda x: x[np.minimum(np.arange(first, first + count), len(x) - 1)], own)
 
 
+def member_threads() -> ThreadPoolExecutor:
+    """Return the thread pool of this process; starting new threads would take as long as a short run."""
+    return _threads(os.getpid(), thread_count())
+
+
 @lru_cache(maxsize=1)
 def _threads(process: int, count: int) -> ThreadPoolExecutor:
-    """Return the thread pool of this process; starting new threads would take as long as a short run."""
     return ThreadPoolExecutor(count, thread_name_prefix="members")
 
 

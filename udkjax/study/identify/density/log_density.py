@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from udkjax.annotations import Numbers
+from udkjax.arrays import is_traced
 from udkjax.integrate.solution import CAUSES, Result
 from udkjax.study.identify.density.priors import LogDensityOfNumber, PriorDensity, require_priors_of
 from udkjax.study.identify.problem.fit_problem import FitProblem, weighted
@@ -27,12 +28,14 @@ from udkjax.study.identify.problem.prediction import Predictor, TolerancePair
 from udkjax.study.identify.problem.residuals import reduce_groups
 from udkjax.study.identify.problem.unknowns import Target, Unknown, Unknowns
 from udkjax.study.identify.records.records import IdentificationError
+from udkjax.study.members import member_threads
 from udkjax.study.noise import NOISE_FLOOR
 
 # Largest number of steps of a run, relative to those at the start. With numbers far from the start, such as masses times 1e13, a
 # run could take minutes, and all other chains of a batch would wait for it.
 MOST_STEPS = 20
 BATCH = 16  # runs of a batch whose outputs stay in the processor's cache: 1,024 four-bars with 500 outputs take half the time
+PART = 8 * BATCH  # runs of a thread: of a quarter of the weights of a normal approximation, two threads have one part each
 
 
 class InferenceProblem:
@@ -187,7 +190,7 @@ class InferenceProblem:
         return self.compiled("prior", curvature)(x)
 
     def log_densities(self, x: Float[Array, "B K"] | Numbers) -> Float[Array, "B"]:
-        """Return `log_density` of several vectors (B, K), by a compiled function."""
+        """Return `log_density` of several vectors (B, K), by a compiled function, many of them on all threads."""
 
         def densities(problem: "InferenceProblem", x: Array) -> Array:
             each = jax.vmap(problem.log_density)
@@ -196,7 +199,13 @@ class InferenceProblem:
             batches = jnp.pad(x, ((0, -len(x) % BATCH), (0, 0)), mode="edge").reshape(-1, BATCH, x.shape[1])
             return jax.lax.map(each, batches).reshape(-1)[: len(x)]
 
-        return self.compiled("densities", densities)(x)
+        compiled = self.compiled("densities", densities)
+        if is_traced(x) or len(x) <= PART:
+            return compiled(x)
+        points = np.asarray(x, float)
+        parts = np.pad(points, ((0, -len(points) % PART), (0, 0)), mode="edge").reshape(-1, PART, points.shape[1])
+        each = member_threads().map(lambda part: np.asarray(compiled(part)), parts)
+        return jnp.asarray(np.concatenate(list(each))[: len(points)])
 
     def compiled(self, name: str, function: Callable[..., Any]) -> Callable[..., Any]:
         """Return a function of a problem and other arguments, compiled for this problem and others with its `programs`."""
