@@ -43,7 +43,12 @@ def is_traced(tree: Any) -> bool:
 
 
 def without_derivatives(tree: Any) -> Any:
-    """Return a tree without tangents: its numbers are concrete where only derivatives trace them, as in `jax.grad(f)(x)`."""
+    """Return a tree without tangents: its numbers are concrete where only derivatives trace them, as in `jax.grad(f)(x)`.
+
+    If nothing is traced, it is the tree itself, with what is stored for it.
+    """
+    if not is_traced(tree):
+        return tree
     return jax.tree.map(lambda x: jax.lax.stop_gradient(x) if isinstance(x, Tracer) else x, tree)
 
 

@@ -57,12 +57,9 @@ class PolynomialMotion(NamedTuple):
 
     def at(self, u: Any, piece: Int[np.ndarray, "n"], body: Any = slice(None)) -> tuple[np.ndarray, np.ndarray]:
         """Return the poses of bodies in pieces, and their derivatives by u."""
-        stage, h = self.points[:, piece, body], np.diff(self.u)[piece]
-        t, h = (x.reshape(-1, *[1] * (stage.ndim - 2)) for x in ((u - self.u[piece]) / h, h))
-        while len(stage) > 2:  # de Casteljau
-            stage = stage[:-1] + t * (stage[1:] - stage[:-1])
-        way = stage[1] - stage[0]
-        return stage[0] + t * way, (len(self.points) - 1) * way / h
+        h = np.diff(self.u)[piece]
+        t, h = (x.reshape(-1, *[1] * (self.points[0, piece, body].ndim - 1)) for x in ((u - self.u[piece]) / h, h))
+        return de_casteljau(self.points[:, piece, body], t, h)
 
     def largest_derivatives(self) -> Float[np.ndarray, "2 2 pieces bodies"]:
         """Return bounds of speed and angular velocity, and of acceleration and angular acceleration, over each piece."""
@@ -71,6 +68,15 @@ class PolynomialMotion(NamedTuple):
             stage = (len(stage) - 1) * np.diff(stage, axis=0) / h
             found.append([np.hypot(stage[..., 0], stage[..., 1]).max(0), np.abs(stage[..., 2]).max(0)])
         return np.array(found)
+
+
+def de_casteljau(stage: Any, t: Any, h: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Return the values of polynomials with these control points (degree+1, ...) at shares t of intervals h, and their slopes."""
+    degree = len(stage) - 1
+    while len(stage) > 2:
+        stage = stage[:-1] + t * (stage[1:] - stage[:-1])
+    way = stage[1] - stage[0]
+    return stage[0] + t * way, degree * way / h
 
 
 def motion_of_run(run: StateHistory) -> PolynomialMotion:

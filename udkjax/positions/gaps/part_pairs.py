@@ -46,28 +46,28 @@ class PartPairs(NamedTuple):
 
     def take(self, k: Any) -> "PartPairs":
         """Return those of the numbers k."""
-        return PartPairs(*(x[..., k] for x in self))
+        return PartPairs(*(x.take(k, -1) for x in self))  # contiguous along the pairs, unlike x[..., k]
 
     @property
     def reach(self) -> Float[np.ndarray, "2 n"]:
         """The largest distances of corners from the origins of their bodies."""
         return np.stack([np.hypot(x[:, 0], x[:, 1]).max(0) for x in (self.A, self.B)])
 
-    def placed(self, q: Sequence[Float[np.ndarray, "n 3"]]) -> list[np.ndarray]:
+    def placed(self, q: Sequence[Float[np.ndarray, "3 n"]]) -> list[np.ndarray]:
         """Return the corners in poses of the bodies."""
         found = []
-        for corners, (x, y, angle) in zip((self.A, self.B), (pose.T for pose in q), strict=True):
+        for corners, (x, y, angle) in zip((self.A, self.B), q, strict=True):
             cos, sin = np.cos(angle), np.sin(angle)
             a, b = corners[:, 0], corners[:, 1]
             found.append(np.stack([x + cos * a - sin * b, y + sin * a + cos * b], 1))
         return found
 
-    def gaps(self, q: Sequence[Float[np.ndarray, "n 3"]]) -> Float[np.ndarray, "n"]:
+    def gaps(self, q: Sequence[Float[np.ndarray, "3 n"]]) -> Float[np.ndarray, "n"]:
         """Return the gaps in poses of the bodies."""
         return signed_distance(*self.placed(q)) - self.radius
 
     def closest(self, poses: Sequence[tuple[np.ndarray, np.ndarray]]) -> Closest:
-        """Return the closest places of the pairs in poses (n, 3) of the bodies, given with their rates."""
+        """Return the closest places of the pairs in poses (3, n) of the bodies, given with their rates."""
         A, B = placed = self.placed([q for q, _ in poses])
         found, every = feature(A, B), np.arange(len(self.owner))
         corner, start, end = (
@@ -81,8 +81,8 @@ class PartPairs(NamedTuple):
         places = np.where(found.of_a, [corner, place], [place, corner])
         rates = []
         for (q, v), here in zip(poses, places, strict=True):
-            arm = here - q.T[:2]
-            rates.append((n * (v.T[:2] + v[:, 2] * np.stack([-arm[1], arm[0]]))).sum(0))
+            arm = here - q[:2]
+            rates.append((n * (v[:2] + v[2] * np.stack([-arm[1], arm[0]]))).sum(0))
         return Closest(found, n, places, rates[1] - rates[0], placed)
 
 

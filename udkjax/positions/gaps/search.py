@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.optimize.elementwise import find_root
 
 from udkjax.positions.gaps.convex import Feature
-from udkjax.positions.gaps.motion import PolynomialMotion
+from udkjax.positions.gaps.motion import PolynomialMotion, de_casteljau
 from udkjax.positions.gaps.part_pairs import Closest, PartPairs, part_pairs
 from udkjax.positions.gaps.shapes import ConvexPart
 
@@ -72,8 +72,9 @@ class PairSearch:
     """The gaps of pairs of parts of the same numbers of corners along a motion."""
 
     def __init__(self, pairs: PartPairs, motion: PolynomialMotion):
-        self.pairs, self.motion, self.nodes = pairs, motion, motion.nodes
-        known, count, h = motion.known, len(pairs.owner), np.diff(motion.u)
+        self.pairs, self.motion, self.nodes, self.steps = pairs, motion, motion.nodes, np.diff(motion.u)
+        self.controls = motion.points.reshape(len(motion.points), -1, 3)  # of piece p and body b in row p * bodies + b
+        known, count, h = motion.known, len(pairs.owner), self.steps
         places = self.nodes[:, np.unique(pairs.bodies), :2][np.append(known, False) | np.append(False, known)]
         self.size = float(np.ptp(places, axis=(0, 1)).max()) + float(pairs.reach.max()) + float(pairs.radius.max())
         speeds, accelerations = motion.largest_derivatives()
@@ -89,12 +90,19 @@ class PairSearch:
     def gaps(self, k: np.ndarray, piece: np.ndarray, u: np.ndarray) -> Float[np.ndarray, "n"]:
         """Return the gaps of pairs k at parameters."""
         pairs = self.pairs.take(k)
-        return pairs.gaps([self.motion.at(u, piece, body)[0] for body in pairs.bodies])
+        return pairs.gaps([pose for pose, _ in self._poses(pairs, piece, u)])
 
     def closest(self, k: np.ndarray, piece: np.ndarray, u: np.ndarray) -> Closest:
         """Return the closest places of pairs k at parameters."""
         pairs = self.pairs.take(k)
-        return pairs.closest([self.motion.at(u, piece, body) for body in pairs.bodies])
+        return pairs.closest(self._poses(pairs, piece, u))
+
+    def _poses(self, pairs: PartPairs, piece: np.ndarray, u: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Return the poses (3, n) of both bodies of pairs, and their derivatives by u; contiguous, as arithmetic is fastest."""
+        h = self.steps[piece]
+        t, (degree, count) = (u - self.motion.u[piece]) / h, (len(self.controls), self.nodes.shape[1])
+        rows = (self.controls.take(piece * count + body, 1) for body in pairs.bodies)
+        return [de_casteljau(np.ascontiguousarray(x.reshape(degree, -1, 3).swapaxes(1, 2)), t, h) for x in rows]
 
     def run(self, least: Float[np.ndarray, "owners"]) -> None:
         """Split intervals until no gap can be below the least found, which is updated, and no touch is hidden within one."""
@@ -132,7 +140,7 @@ class PairSearch:
 
     def _at_nodes(self, k: np.ndarray, node: np.ndarray) -> np.ndarray:
         pairs = self.pairs.take(k)
-        return pairs.gaps([self.nodes[node, body] for body in pairs.bodies])
+        return pairs.gaps([np.ascontiguousarray(self.nodes[node, body].T) for body in pairs.bodies])
 
     def _way(self, k: np.ndarray, i: np.ndarray, j: np.ndarray) -> np.ndarray:
         """Return the sum of the ways of both parts from node i to node j."""
@@ -169,11 +177,10 @@ class PairSearch:
         way = 0.5 * self._way(k, piece, piece + 1) * h / np.diff(self.motion.u)[piece]
         line, turn = (x[piece, bodies] for x in self.bends)
         sag = (line + turn * self.reach[:, k]).sum(0) * h**2 / 8
-        ends, chords = [self.closest(k, piece, x) for x in u.T], []
-        for here, there, near in zip(ends, ends[::-1], d.T, strict=True):
-            A, B = ((here.n * x).sum(1) for x in there.placed)
-            chords.append(np.minimum(near, B.min(0) - A.max(0) - self.pairs.radius[k]))
-        return np.maximum(d.mean(1) - way, np.maximum(*chords) - sag), d.mean(1) + way
+        here = self.closest(np.tile(k, 2), np.tile(piece, 2), u.T.ravel())  # at the starts, then at the ends
+        A, B = ((here.n * np.roll(x, len(k), -1)).sum(1) for x in here.placed)  # places at one end, along n of the other one
+        chords = np.minimum(d.T, (B.min(0) - A.max(0)).reshape(2, -1) - self.pairs.radius[k])
+        return np.maximum(d.mean(1) - way, chords.max(0) - sag), d.mean(1) + way
 
     def _split(self, k: np.ndarray, piece: np.ndarray, u: np.ndarray, d: np.ndarray, least: np.ndarray) -> tuple[np.ndarray, ...]:
         """Return the parts of intervals, with their gaps."""
@@ -190,19 +197,19 @@ class PairSearch:
     def found(self, k: Int[np.ndarray, "n"], low_of: Float[np.ndarray, "owners"]) -> list[Least]:
         """Return the least gaps of pairs of parts k, where they cease to fall or at an end, with bounds of pairs of links."""
         m, u, step = self.motion, self.u[k], self.step[k]
-        chain = np.searchsorted(self.starts, self.piece[k], side="right") - 1
+        every, chain = np.arange(len(k)), np.searchsorted(self.starts, self.piece[k], side="right") - 1
         first, last = self.starts[chain], self.ends[chain] - 1
 
         def at(u: np.ndarray, some: Any = slice(None)) -> tuple[np.ndarray, ...]:
             pieces = np.searchsorted(m.u, u, side="right") - 1
             return k[some], np.clip(pieces, first[some], last[some]), u
 
-        low, high = np.maximum(m.u[first], u - step), np.minimum(m.u[last + 1], u + step)
-        slopes = self.closest(*at(low)).rate, self.closest(*at(high)).rate
+        ends = low, high = np.maximum(m.u[first], u - step), np.minimum(m.u[last + 1], u + step)
+        slopes = self.closest(*at(np.concatenate(ends), np.tile(every, 2))).rate.reshape(2, -1)
         root, inner = u.copy(), np.flatnonzero((slopes[0] < 0) & (slopes[1] > 0))
         root[inner] = _roots(lambda x, some: self.closest(*at(x, some)).rate, low[inner], high[inner], inner)
         places = np.stack([root, low, high, u])
-        u = places[np.argmin([self.gaps(*at(x)) for x in places], 0), np.arange(len(k))]
+        u = places[np.argmin(self.gaps(*at(places.ravel(), np.tile(every, 4))).reshape(4, -1), 0), every]
         distances, here = self.gaps(*at(u)), self.closest(*at(u))
         fixed = ((u <= m.u[first]) & (slopes[0] > 0)) | ((u >= m.u[last + 1]) & (slopes[1] < 0))
         sides = [self.closest(*at(np.clip(u + side * BESIDE * step, low, high))) for side in (-1, 1)]

@@ -12,13 +12,14 @@ from jaxtyping import Float, Int
 from udkjax.arrays import by_numpy, library_for, without_derivatives
 from udkjax.positions.assembling.channels import pins_of, point_of_pin
 from udkjax.programs.deferred import deferred
+from udkjax.programs.identity_cache import cached_by_identity
 from udkjax.scene.elements.bodies import GROUND
 from udkjax.scene.elements.joints import Cam
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.tables.checks import SceneError
 from udkjax.wording import quote, suggestion
 
-_drawn_shapes = deferred(lambda drawing: drawing.shapes(), keeps_concrete=True)
+_drawn_shapes = cached_by_identity(deferred(lambda drawing: drawing.shapes(), keeps_concrete=True))
 CAM_CORNERS = 180  # of the outline of a cam: one each two degrees, as in pictures
 
 
