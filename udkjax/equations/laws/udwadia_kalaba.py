@@ -20,6 +20,8 @@ and beta; None: no stabilization. `w` are the weights (m,); None: all weights ar
 of friction that depends on lambda (rubbing.py); None: no such friction.
 """
 
+from typing import NamedTuple
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -80,8 +82,30 @@ def b(
     friction: Loads = None,
 ) -> Float[Array, "m"]:
     """Return b = gamma - 2 alpha Psi_dot - beta^2 Psi - Psi_q a_F: the part of the constraints that a_F does not satisfy."""
-    free = constraints.psi_q(mechanism, t, q) @ a_F(mechanism, t, q, v, friction)
-    return weigh(w, drift(mechanism, t, q, v, baumgarte) - free)
+    return _terms(mechanism, t, q, v, baumgarte, w, friction).b
+
+
+class _Terms(NamedTuple):
+    """D, b and a_F of a state."""
+
+    D: Float[Array, "m n"]
+    b: Float[Array, "m"]
+    a_F: Float[Array, "n"]
+
+
+def _terms(
+    mechanism: Mechanism,
+    t: NumberLike,
+    q: BodyArray,
+    v: BodyArray,
+    baumgarte: Baumgarte | None,
+    w: Weights,
+    friction: Loads = None,
+) -> _Terms:
+    """Return the terms of a state, with Psi_q and F computed once: programs of derivatives have copies of each."""
+    slopes, free = constraints.psi_q(mechanism, t, q), a_F(mechanism, t, q, v, friction)
+    missing = drift(mechanism, t, q, v, baumgarte) - slopes @ free
+    return _Terms(weigh(w, slopes * inverse_sqrt_mass(mechanism)), weigh(w, missing), free)
 
 
 def drift(
@@ -106,8 +130,8 @@ def accelerations(
     friction: Loads = None,
 ) -> Float[Array, "n"]:
     """Return a = a_F + M^(-1/2) D^+ b."""
-    x = pseudoinverse(method, D(mechanism, t, q, w)) @ b(mechanism, t, q, v, baumgarte, w, friction)
-    return a_F(mechanism, t, q, v, friction) + inverse_sqrt_mass(mechanism) * x
+    terms = _terms(mechanism, t, q, v, baumgarte, w, friction)
+    return terms.a_F + inverse_sqrt_mass(mechanism) * (pseudoinverse(method, terms.D) @ terms.b)
 
 
 def multipliers(
@@ -120,8 +144,9 @@ def multipliers(
     w: Weights = None,
 ) -> Float[Array, "m"]:
     """Return lambda = -(D^+)^T D^+ b: without w, the multipliers of least norm with M a + Psi_q^T lambda = F."""
-    D_plus = pseudoinverse(method, D(mechanism, t, q, w))
-    return weigh(w, -(D_plus.T @ (D_plus @ b(mechanism, t, q, v, baumgarte, w))))
+    terms = _terms(mechanism, t, q, v, baumgarte, w)
+    D_plus = pseudoinverse(method, terms.D)
+    return weigh(w, -(D_plus.T @ (D_plus @ terms.b)))
 
 
 def project(

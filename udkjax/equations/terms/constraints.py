@@ -45,7 +45,7 @@ def psi(mechanism: Mechanism, t: NumberLike, q: BodyArray) -> Float[Array, "m"]:
     kinds = evaluate_by_kind(
         lambda c, *frames: vector(c.residual(t, *frames)), mechanism, [*mechanism.constraints.values()], bodies(q)
     )
-    return jnp.concatenate([jnp.ravel(rows) for _, rows in kinds])[_row_order(kinds)] if kinds else jnp.zeros(0)
+    return _in_order(kinds) if kinds else jnp.zeros(0)
 
 
 @traced_once
@@ -104,7 +104,7 @@ def rolling_rates(mechanism: Mechanism, t: NumberLike, q: BodyArray, v: BodyArra
         return jnp.zeros_like(vector(constraint.residual(now, *frames)))
 
     kinds = evaluate_by_kind(rates, mechanism, [*mechanism.constraints.values()], bodies(q), bodies(v))
-    return jnp.concatenate([jnp.ravel(rows) for _, rows in kinds])[_row_order(kinds)]
+    return _in_order(kinds)
 
 
 def rolling_rows(mechanism: Mechanism) -> Bool[np.ndarray, "m"]:
@@ -143,10 +143,12 @@ def row_names(mechanism: Mechanism) -> list[tuple[str, int]]:
     return [(name, k) for name, count in zip(names, size, strict=True) for k in range(count)]
 
 
-def _row_order(kinds: Sequence[tuple[ElementKind, Array]]) -> np.ndarray:
-    """Return the permutation from rows ordered by kind to rows in the order of their constraints."""
+def _in_order(kinds: Sequence[tuple[ElementKind, Array]]) -> Float[Array, "m"]:
+    """Return rows of constraints sorted by kind in the order of their constraints."""
+    rows = jnp.concatenate([jnp.ravel(rows) for _, rows in kinds])
     owner = np.concatenate([np.repeat(kind.members, rows.shape[1]) for kind, rows in kinds])
-    return np.argsort(owner, kind="stable")
+    order = np.argsort(owner, kind="stable")
+    return rows if np.array_equal(order, np.arange(len(order))) else rows[order]
 
 
 def rate_along_motion(f: Callable[[Array, Array], Array], t: NumberLike, q: BodyArray, v: BodyArray) -> Array:

@@ -178,6 +178,14 @@ def element_kinds(
     return result
 
 
+def _entries(x: Float[Array, "bodies"], which: Int[np.ndarray, "n"]) -> Float[Array, "n"]:
+    """Return the entries of some bodies; those after each other, as in chains, take one operation, in derivatives too."""
+    start, count = int(which[0]), len(which)
+    if np.array_equal(which, np.arange(start, start + count)):
+        return x if count == len(x) else x[start : start + count]
+    return x.at[which].get(mode="promise_in_bounds", wrap_negative_indices=False)
+
+
 def evaluate_by_kind(
     function: Callable[..., Result], mechanism: Mechanism, elements: Sequence[Element], *states: Float[Array, "bodies 3"]
 ) -> list[tuple[ElementKind, Result]]:
@@ -192,18 +200,20 @@ def evaluate_by_kind(
     Returns:
         The kinds, each with its results; the first axis is that of the elements.
     """
-    q, results = states[0], []
-    cos, sin = jnp.cos(q[:, 2:]), jnp.sin(q[:, 2:])
-    frames = jnp.concatenate([q, cos, sin, *states[1:]], axis=1)  # the fields of `Frame` of each body
+    results: list[tuple[ElementKind, Result]] = []
+    x, y, angle = (states[0][:, k] for k in range(3))
+    # the fields of `Frame` of each body
+    fields = [x, y, angle, jnp.cos(angle), jnp.sin(angle), *(v[:, k] for v in states[1:] for k in range(3))]
     ground = GROUND_FRAME if len(states) == 1 else GROUND_FRAME_AT_REST
     for kind in element_kinds(mechanism, elements):
 
-        def evaluate(leaves: Sequence[Array], body_frames: Array, kind: ElementStructure = kind.structure) -> Result:
-            moving_frames = iter(body_frames)
+        def evaluate(leaves: Sequence[Array], moving: Sequence[Frame], kind: ElementStructure = kind.structure) -> Result:
+            moving_frames = iter(moving)
             element = jax.tree.unflatten(kind.tree, leaves)
-            return function(element, *(ground if fixed else Frame(*next(moving_frames)) for fixed in kind.ground))
+            return function(element, *(ground if fixed else next(moving_frames) for fixed in kind.ground))
 
         columns = zip(*(jax.tree.leaves(elements[i]) for i in kind.members), strict=True)
         leaves = [jnp.asarray(numbers_as_vector(column)).reshape(-1, *np.shape(column[0])) for column in columns]
-        results.append((kind, jax.vmap(evaluate)(leaves, frames[kind.bodies.T])))
+        moving = [Frame(*(_entries(field, which) for field in fields)) for which in kind.bodies]
+        results.append((kind, jax.vmap(evaluate, axis_size=len(kind.members))(leaves, moving)))
     return results

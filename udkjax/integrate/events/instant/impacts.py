@@ -101,6 +101,13 @@ class Impulses(NamedTuple):
     remaining: Bool[Any, "*m"]  # whether constraints still drive a contact to penetrate
 
 
+class KnownContacts(NamedTuple):
+    """The contacts at an event of a run that is differentiated: as they were found when it ran."""
+
+    closed: Int[Any, "*m E"]  # OPEN, TOUCHES or SLOW
+    held: Bool[Any, "*m E"]  # after the event
+
+
 class ContactChanges(NamedTuple):
     """The contacts at an event, and their states after it."""
 
@@ -239,7 +246,7 @@ def hit_contacts(
     rows: ContactRows,
     rate: Float[Any, "*m E"],
     second_rates: Callable[[Any], Any],
-    closed: Int[Any, "*m E"] | None,
+    known: KnownContacts | None,
     xp: ModuleType = jnp,
 ) -> ContactChanges:
     """Apply an impact to all closed contacts, and determine which of them then rest.
@@ -253,14 +260,13 @@ def hit_contacts(
         rows: the rows of the conditions in that phase.
         rate: the first rates of all conditions at v; of sliding along a line, the speeds.
         second_rates: maps velocities to the second rates of all conditions in that phase.
-        closed: the contacts, as in `ContactChanges`; None: not known yet.
+        known: the contacts, which leave nothing to decide; None: not known yet.
         xp: jax.numpy, or NumPy.
     """
     stop: Callable[[Any], Any] = (lambda x: x) if xp is np else stop_gradients
     scale, system = stop(before.scale), contacts.rate[..., None]
     floor = ZERO_RATE * scale * system
-    closed = closed if closed is not None else contact_states(contacts, k, held, before, rows.W, xp)
-    assert closed is not None
+    closed = contact_states(contacts, k, held, before, rows.W, xp) if known is None else known.closed
     restitution = xp.where(closed == SLOW, 0.0, contacts.restitution)
     touches = closed > OPEN
     rubs = touches & (contacts.tangents >= 0)
@@ -275,6 +281,9 @@ def hit_contacts(
     def velocities(impact: Impulses) -> Any:
         return v + (impact.impulse[..., None, :] @ rows.directions)[..., 0, :]
 
+    if known is not None:
+        impact, no = impulses(restitution), xp.zeros_like(touches)
+        return ContactChanges(velocities(impact), closed, no, known.held, known.held, no, no, impact.remaining)
     # The set of held contacts is discrete, and has no derivatives.
     W, fixed_rate, pressed = stop(rows.W), stop(rate), ZERO_RATE_2 * scale * system**2
     may_stay = (touches) & rows.free & (np.arange(rate.shape[-1]) + rate.shape[-1] != k[..., None])

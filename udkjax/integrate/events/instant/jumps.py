@@ -17,6 +17,7 @@ from udkjax.integrate.events.instant.impacts import (
     OPEN,
     ContactChanges,
     Contacts,
+    KnownContacts,
     hit_contacts,
     rows_of_directions,
     rows_of_mobilities,
@@ -45,7 +46,7 @@ def apply_event(
     before: RunState,
     values: ConditionValues,
     state_values: StateValues,
-    closed: Int[Any, "b E"] | None = None,
+    known: KnownContacts | None = None,
     modes: FrictionModes | None = None,
 ) -> JumpResult:
     """Apply the action of event k of each member, or, if k >= E, release the contact of event k - E.
@@ -57,10 +58,10 @@ def apply_event(
         before: their states before the event.
         values: the conditions in these states.
         state_values: derivatives of the conditions, and directions of impulses.
-        closed: the states of the contacts that take part, OPEN, TOUCHES or SLOW; None: not known yet.
+        known: the contacts of the event; None: not known yet.
         modes: the modes of joints with set-valued friction after the event; None: not known yet.
     """
-    found, gaps = _apply_event(system, members, k, before, values, state_values, closed)
+    found, gaps = _apply_event(system, members, k, before, values, state_values, known)
     if system.plan.sticking:
         found = _settle_friction(system, members, k, found, modes)
     return found if gaps is None else found._replace(state=found.state._replace(q=close_contacts(system, gaps, found.state)))
@@ -86,7 +87,7 @@ def _apply_event(
     before: RunState,
     values: ConditionValues,
     state_values: StateValues,
-    closed: Int[Any, "b E"] | None,
+    known: KnownContacts | None,
 ) -> tuple[JumpResult, Gaps | None]:
     """Apply events, except the decisions of joints with set-valued friction; return the contacts, too, if any are closed."""
     plan, xp = system.plan, system.xp
@@ -128,7 +129,7 @@ def _apply_event(
         after = state._replace(v=v, phase=plan.without_contacts(state.phase))
         return system.look(members, after if xp is np else stop_gradients(after), is_free=not plan.sticking).rate_2
 
-    hit = hit_contacts(_contacts(system, members), k, v, held, values, rows, rate, second_rates, closed, xp)
+    hit = hit_contacts(_contacts(system, members), k, v, held, values, rows, rate, second_rates, known, xp)
     contacts = hit._replace(
         closed=xp.where(acts, hit.closed, OPEN),
         hits=hit.hits & acts,

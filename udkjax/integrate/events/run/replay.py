@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
 from udkjax.annotations import TreeDef
+from udkjax.integrate.events.instant.impacts import KnownContacts
 from udkjax.integrate.events.instant.jumps import apply_event
 from udkjax.integrate.events.instant.runs import EventRun, RunState
 from udkjax.integrate.events.instant.sticking import modes_of, settle_friction
@@ -319,7 +320,8 @@ def _apply_at_fixed_time(
         evaluated = condition_values(system, None, before)
     at_end = with_member(state._replace(phase=found.event_phase[j], joints=(*state.joints[:-1], found.sides[j])))
     modes = modes_of(system, None, at_end) if system.plan.sticking else None
-    after = apply_event(system, None, k[None], before, *evaluated, found.closed[j][None], modes).state
+    known = KnownContacts(found.closed[j][None], system.plan.held(at_end.phase, jnp))
+    after = apply_event(system, None, k[None], before, *evaluated, known, modes).state
     after = without_member(after)._replace(phase=found.event_phase[j])
     after = after._replace(joints=(*after.joints[:-1], found.sides[j]))
     a_after = fixed.hybrid.accelerations(stop_gradients(after) if first_only else after)
