@@ -316,8 +316,6 @@ def _apply_at_fixed_time(
     _, of_h = _second_order(d, hybrid, state)
     d = d - jnp.where(is_transversal, of_h[k % E] / stop_gradients(rate), 0.0)
     before = with_member(_moved(hybrid, state, d, a))
-    if system.plan.impacts.any():  # impulses depend on the derivatives of conditions
-        evaluated = condition_values(system, None, before)
     at_end = with_member(state._replace(phase=found.event_phase[j], joints=(*state.joints[:-1], found.sides[j])))
     modes = modes_of(system, None, at_end) if system.plan.sticking else None
     known = KnownContacts(found.closed[j][None], system.plan.held(at_end.phase, jnp))
