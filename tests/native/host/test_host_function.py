@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from tests.fresh_process import python
 from udkjax.native.host.host_function import call_host
 
 
@@ -51,3 +52,23 @@ def test_it_runs_within_loops():
 def test_an_error_is_that_of_the_program():
     with pytest.raises(Exception, match="no norm today"):
         jax.block_until_ready(jax.jit(lambda x: norm(1.0, x, fails=True))(np.ones(2)))
+
+
+def test_stored_programs_with_events_are_found_by_later_processes(tmp_path):
+    """JAX finds programs by their text, in which functions of Python must have the same names, made in any order."""
+    code = """
+import jax, udkjax as udk
+rod = udk.library.compound_pendulum(angle=1.2)
+friction = {"dry": udk.Friction("pin", torque=0.4, law="set-valued")}
+mech = udk.Mechanism(rod.bodies, {"pin": next(iter(rod.joints.values()))}, forces=friction)
+for lower in ORDER:
+    events = None if lower is None else udk.JointLimit("pin", lower=lower, restitution=0.5)
+    run = lambda mass: udk.simulate(mech.with_parameters({"body.rod.mass": mass}), [0.0, 1.0], events=events).q[-1, 0, 2]
+    print(float(jax.jit(run)(1.0)))
+"""
+    settings = {"UDKJAX_CACHE": 0, "JAX_COMPILATION_CACHE_DIR": tmp_path, "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": 0}
+    found = python(code.replace("ORDER", "(None, 0.2)"), **settings).split()
+    programs = {path.name for path in tmp_path.glob("*-cache")}
+    assert len(set(found)) == 2 and sum("lambda" in name for name in programs) == 2
+    assert python(code.replace("ORDER", "(0.2, None)"), **settings).split() == found[::-1]
+    assert {path.name for path in tmp_path.glob("*-cache")} == programs

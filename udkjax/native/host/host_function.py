@@ -5,11 +5,14 @@ function must not call JAX: JAX may wait for the thread that runs the function.
 """
 
 import ctypes
+import hashlib
 import math
+import re
 import traceback
-import uuid
+from collections import Counter
 from collections.abc import Callable, Hashable, Sequence
 from functools import lru_cache
+from threading import Lock
 from typing import Any, NamedTuple, Protocol
 
 import jax
@@ -43,7 +46,10 @@ from udkjax.programs.varying_axes import result_type
 
 
 class HostFunction(Hashable, Protocol):
-    """A function of arrays, each (1 or members, ...); equal functions are compiled once."""
+    """A function of arrays, each (1 or members, ...); equal functions are compiled once.
+
+    Its `description`, if it has one, tells it from others in all processes, so that programs that call it can be stored.
+    """
 
     def __call__(self, *inputs: Any) -> Sequence[Any]:
         """Return the outputs, all (members, ...)."""
@@ -88,6 +94,11 @@ class _TracedFunction:
 
     def __hash__(self) -> int:
         return hash(id(self._program))
+
+    @property
+    def description(self) -> str:
+        """The text of the program."""
+        return str(self._program)
 
     def __call__(self, *inputs: Any) -> Sequence[Any]:
         members = max(len(x) for x in inputs)
@@ -155,7 +166,7 @@ def _result_shapes(inputs: Sequence[Any], function: HostFunction) -> list[jax.Sh
 class _Target(NamedTuple):
     """A function of Python as a target of XLA."""
 
-    name: str  # unique to this process: stored programs must not call another process's function
+    name: str  # unique in this process; functions of equal descriptions have the same name in each, which stored programs call
     handler: int  # its address
 
 
@@ -178,7 +189,7 @@ def _target(function: HostFunction) -> _Target:
             return _error(_word(frame + API), traceback.format_exc())
         return None
 
-    name = f"udkjax_host_{uuid.uuid4().hex}"
+    name = _name(function)
     address = ctypes.cast(handle, ctypes.c_void_p)
     jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(address), platform="cpu")
     _REGISTERED.append(handle)
@@ -187,6 +198,16 @@ def _target(function: HostFunction) -> _Target:
     return _Target(name, address.value)
 
 
+def _name(function: HostFunction) -> str:
+    """Return the name of a function: JAX finds a program that it has stored by the program's text, which contains the name."""
+    text = f"{type(function).__name__} {getattr(function, 'description', '')} {function.shapes(1)}"
+    digest = hashlib.sha256(re.sub("0x[0-9a-f]+", "", text).encode()).hexdigest()[:32]  # without addresses of this process
+    with _LOCK:
+        _EQUALLY_DESCRIBED[digest] += 1
+        return f"udkjax_host_{digest}_{_EQUALLY_DESCRIBED[digest]}"
+
+
+_LOCK, _EQUALLY_DESCRIBED = Lock(), Counter[str]()
 _REGISTERED: list[Any] = []  # XLA may call these for as long as the process runs
 _NEEDED_BY: dict[str, str] = {}
 

@@ -42,6 +42,11 @@ class HostProgram:
     def __init__(self, program: Any):
         self._program = program
 
+    @property
+    def description(self) -> str:
+        """The text of the program."""
+        return str(self._program)
+
     def __call__(self, *inputs: Any) -> Sequence[Any]:
         """Run the program in a thread of XLA; nothing is traced or compiled here."""
         with jax.transfer_guard("allow"), jax.debug_nans(False):

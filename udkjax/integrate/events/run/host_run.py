@@ -109,6 +109,11 @@ class HostRun:
             return f'joints stick ({", ".join(joints)}): give their friction law="smooth"'
         return "runs have events, contacts or forces with kinks of the state: leave out events, and make forces smooth"
 
+    @property
+    def description(self) -> str:
+        """The events and the structure of the system."""
+        return f"{self.plan.events} {self.times} {self.plain and (self.plain.tree, self.plain.others, self.plain.shapes)}"
+
     def shapes(self, members: int) -> list[tuple[int, ...]]:
         """Return the shapes of the fields of `EventRun`, with a leading axis of members."""
         plan = self.plan.events
