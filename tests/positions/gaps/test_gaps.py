@@ -14,6 +14,7 @@ import udkjax as udk
 from experiments.parts.gap_linkages import placed, random_linkage
 from tests.command_line import udkjax
 from udkjax.positions.gaps.convex import feature, gap_at, signed_distance
+from udkjax.positions.gaps.pairs import joined_pairs
 from udkjax.positions.gaps.shapes import convex_pieces, hull
 
 FOUR_BAR = {"O": [0.0, 0.0], "A": [0.03, 0.04], "B": [0.16, 0.11], "C": [0.18, 0.0]}
@@ -249,6 +250,25 @@ def test_shapes_of_bodies_without_a_drawing():
         other = next(x for x in wide.pairs if x.pair == gap.pair)
         less = 0.01 if mech.body_names[0] in gap.pair else 0.0
         assert other.distance == pytest.approx(gap.distance - less, abs=1e-12)
+
+
+def test_links_on_one_pin_are_joined_whichever_of_them_its_joints_connect():
+    """At a pin of three links, and at a place of the ground with two cranks, each link overlaps with each other."""
+    ends = {"crank": "OA", "coupler": "AB", "rocker": "BC", "rod": "BD", "other": "OF"}
+    links = {name: {"pins": list(pins), "mass": 1} for name, pins in ends.items()}
+    pins = FOUR_BAR | {"D": [0.1, 0.2], "F": [0.03, 0.0]}
+    mech = udk.Drawing(pins=pins, links=links, ground=["O", "C"]).mechanism()
+    assert not any({"rocker", "rod"} == set(joint.bodies) for joint in mech.joints.values())
+    found = joined_pairs(mech)
+    assert {frozenset(pair) for pair in found} == {
+        frozenset(pair) for pair in [
+            ("ground", "crank"), ("ground", "other"), ("ground", "rocker"), ("crank", "coupler"), ("coupler", "rocker"),
+            ("coupler", "rod"), ("rocker", "rod"), ("crank", "other"),
+        ]
+    }  # fmt: skip
+    points = mech.parameters()["joint.B-2.points"]
+    moved = mech.with_parameters({"joint.B-2.points": points + np.array([[1e-6, 0.0], [0.0, 0.0]])})
+    assert ("rocker", "rod") not in joined_pairs(moved) and ("coupler", "rod") in joined_pairs(moved)
 
 
 def test_layers_are_the_fewest_and_free_of_contacts():

@@ -171,7 +171,7 @@ def gaps(
     Args:
         mechanism: a mechanism of one degree of freedom once its drivers hold, or any mechanism with a `run`.
         drive: a driver or coordinate, as for `kinematics`; by default the only driver.
-        layers: the layer of each link; all pairs of a layer are measured. By default all pairs that share no joint.
+        layers: the layer of each link; all pairs of a layer are measured. By default all pairs that share no joint or pin.
         pairs: pairs of names of links, instead of layers.
         values: values of the driver (rad, m) between whose least and largest it moves; by default one turn, or from toggle to
             toggle.
@@ -191,8 +191,6 @@ def gaps(
     """
     if run is not None and not (drive is None and values is None and held is None):
         raise ArgumentError("run is given with drive, values or held: leave out either")
-    checked_pairs = pairs_to_check(mechanism, layers, pairs, shapes)
-    names = list(dict.fromkeys(name for pair in checked_pairs for name in pair))
     driver = None if run is not None else only_driver(mechanism) if drive is None else drive
     given = (mechanism, driver, values, run, shapes, held)
     now = without_derivatives(given)
@@ -200,6 +198,8 @@ def gaps(
         cure = "call it outside of jax.jit and jax.vmap; jax.grad and jax.hessian can trace it"
         raise ArgumentTypeError(f"gaps needs concrete numbers, since it decides which positions to compute: {cure}")
     concrete, driver_now, values_now, run_now, shapes_now, held_now = now
+    checked_pairs = pairs_to_check(concrete, layers, pairs, shapes_now)
+    names = list(dict.fromkeys(name for pair in checked_pairs for name in pair))
     parts = parts_of(concrete, shapes_now, names)
     motion = motion_of_run(run_now) if run is not None else motion_of_drive(concrete, driver_now, values_now, held_now)
     least, touches = search(parts, [*mechanism.body_names, GROUND], checked_pairs, motion)

@@ -1,24 +1,42 @@
-"""Pairs of links that can hit each other: those of one layer that no joint connects."""
+"""Pairs of links that can hit each other: those of one layer that no joint or pin connects."""
 
 from collections.abc import Mapping, Sequence
 from itertools import combinations
 from typing import Any
 
+import numpy as np
+
 from udkjax.scene.elements.bodies import GROUND
+from udkjax.scene.elements.joints import Revolute
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.tables.checks import SceneError
 from udkjax.wording import join_names, quote, suggestion
 
 LinkPair = tuple[str, str]
+SAME_PIN = 1e-9  # of the largest coordinate of a pin: two revolutes of a body nearer than this are at one place, up to rounding
 
 
 def joined_pairs(mechanism: Mechanism) -> dict[LinkPair, str]:
-    """Return the pairs of links that share a joint, each with the joint's name."""
+    """Return the pairs of links that share a joint or a pin, each with the joint's name; numbers are concrete.
+
+    Two revolutes at the same place of a third link, or of the ground, are one pin of all their links.
+    """
     found: dict[LinkPair, str] = {}
     for name, joint in mechanism.joints.items():
         if getattr(joint, "points", None) is not None:
             for one, other in combinations(joint.bodies, 2):
                 found[one, other] = found[other, one] = name
+    pins: dict[str, list[tuple[np.ndarray, str, str]]] = {}  # of each body: place, other body and name of a revolute
+    for name, joint in mechanism.joints.items():
+        if isinstance(joint, Revolute):
+            for k, body in enumerate(joint.bodies):
+                pins.setdefault(body, []).append((np.asarray(joint.points)[k], joint.bodies[1 - k], name))
+    size = max((float(np.abs(place).max()) for at in pins.values() for place, _, _ in at), default=0.0)
+    for at in pins.values():
+        for (place, one, name), (there, other, _) in combinations(at, 2):
+            if one != other and np.hypot(*(place - there)) <= SAME_PIN * size:
+                found.setdefault((one, other), name)
+                found.setdefault((other, one), name)
     return found
 
 
@@ -30,10 +48,10 @@ def pairs_to_check(
 ) -> list[LinkPair]:
     """Return the pairs of links whose gaps are asked for; raise a `SceneError` that names unknown links and layers that clash."""
     names = [*mechanism.body_names, *([GROUND] if GROUND in (shapes or {}) else [])]
-    joined = joined_pairs(mechanism)
     if pairs is not None:
         _require(mechanism, _mistakes_in_pairs(mechanism, pairs, layers, shapes))
         return [(one, other) for one, other in pairs]
+    joined = joined_pairs(mechanism)
     if layers is None:
         found = [pair for pair in combinations(names, 2) if pair not in joined]
         cure = "each two of its links share a joint; name pairs, pairs=[(one, other)]"
