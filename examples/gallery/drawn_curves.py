@@ -15,6 +15,7 @@ LETTERS = {
     "K": np.array([0, -6j, -3.6j, 4, 1.5 - 2.25j, 4 - 6j]),
 }
 SIZE = 8.0  # m, from the middle of a curve that is 6 m high
+ENOUGH = 0.02  # error with which a search ends
 TURN = 1.0  # s, at 60 rpm
 FRAMES = 161
 MOMENT = 0.95  # fraction of the motion at which its picture is taken
@@ -27,7 +28,7 @@ def make():
     curves = {name: np.stack([np.real(z), np.imag(z)], 1) for name, z in (LETTERS | {"star": star}).items()}
     facts, mechanisms, motions = {}, {}, {}
     for name, curve in curves.items():
-        best = udk.mechanisms_for(curve, size=SIZE, seconds=600, rounds=1 + (name in ("K", "star")), results=1, progress=False)[0]
+        best = udk.mechanisms_for(curve, size=SIZE, seconds=600, rounds=2, error=ENOUGH, results=1, progress=False)[0]
         facts[f"{name}: error relative to its RMS radius, by {best.bars} bars"] = best.error
         mechanisms[name] = best.mechanism
         share = float(np.ptp(best.values)) / (2 * np.pi)

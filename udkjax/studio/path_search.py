@@ -7,6 +7,7 @@ import numpy as np
 from udkjax.annotations import JsonObject
 from udkjax.scene.drawing.drawn_quantities import Units
 from udkjax.scene.files import dumps
+from udkjax.segments import distances_from_segments
 from udkjax.studio.limits import RefusedError
 from udkjax.studio.text_edits import merge_document, read_document
 from udkjax.synthesis.curves.curve_designs import CurveDesign
@@ -19,6 +20,7 @@ RESULTS = 4
 FEWEST, MOST = 3, 10_000  # points of a wanted path
 CLOSED = 0.08  # a path drawn by hand whose ends are nearer, relative to its length, is closed
 TRANSMISSION = float(np.deg2rad(20.0))  # least transmission angle (rad)
+PART = 500  # points whose distances are computed at once, to bound the memory
 DIGITS = 6  # of the written numbers
 
 
@@ -74,23 +76,15 @@ def _points(path: object) -> np.ndarray:
 def _drawn(design: CurveDesign, points: np.ndarray) -> JsonObject:
     """Return a design as a drawing, with the largest distance of `points` from its curve."""
     text = merge_document("", _rounded(read_document(dumps(design.mechanism))))
-    off = _distances(points, design.curve)
+    parts = np.array_split(points, 1 + len(points) // PART)
+    off = max(distances_from_segments(part, design.curve[:-1], design.curve[1:]).min(1).max() for part in parts)
     return {
         "document": read_document(text),
         "text": text,
-        "deviation": float(off.max()),
+        "deviation": float(off),
         "turns": design.turns,
         "transmission": design.transmission,
     }
-
-
-def _distances(points: np.ndarray, curve: np.ndarray) -> np.ndarray:
-    """Return the distance (P,) of each point from the closed polygon of a curve."""
-    along = np.roll(curve, -1, axis=0) - curve
-    arms = points[:, None] - curve
-    square = np.maximum((along**2).sum(1), np.finfo(float).tiny)
-    share = np.clip((arms * along).sum(2) / square, 0.0, 1.0)
-    return np.linalg.norm(arms - share[..., None] * along, axis=2).min(1)
 
 
 def _rounded(value: Any) -> Any:

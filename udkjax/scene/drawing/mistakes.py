@@ -1,7 +1,7 @@
 """Mistakes in a drawing as a whole: names used twice, unconnected pins and links, degenerate shapes."""
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from itertools import combinations, pairwise
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -20,6 +20,8 @@ from udkjax.scene.drawing.pin_forms import (
 )
 from udkjax.scene.drawing.placement import DrawnElement, PinLayout, Placement
 from udkjax.scene.elements.bodies import GROUND
+from udkjax.scene.outlines.contours import contains
+from udkjax.segments import distances_from_segments
 from udkjax.wording import quote
 
 DrawnGroups = Mapping[str, Mapping[str, Any]]  # elements by section and name
@@ -259,16 +261,8 @@ def _crosses_itself(corners: np.ndarray) -> bool:
 
 def _reaches(corners: np.ndarray, point: PointArray) -> bool:
     """Return True if a point is inside a polygon, or outside by no more than the gaps of a drawing to scale."""
-    tolerance = DRAWN_GAP * extent(list(corners))
-    inside = False
-    for a, b in [*pairwise(corners), (corners[-1], corners[0])]:
-        side, arm = b - a, point - a
-        fraction = np.clip(side @ arm / max(side @ side, 1e-300), 0.0, 1.0)
-        if np.linalg.norm(arm - fraction * side) <= tolerance:
-            return True
-        if (a[1] > point[1]) != (b[1] > point[1]) and point[0] < a[0] + side[0] * arm[1] / side[1]:
-            inside = not inside
-    return inside
+    outside_by = distances_from_segments(np.asarray(point)[None], corners, np.roll(corners, -1, axis=0)).min()
+    return bool(outside_by <= DRAWN_GAP * extent(list(corners))) or contains(corners, np.asarray(point))
 
 
 def gap_mistakes(placement: Placement, groups: DrawnGroups) -> Iterator[str]:

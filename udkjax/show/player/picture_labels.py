@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from udkjax.scene.mechanism import Mechanism
+from udkjax.segments import distances_from_segments
 from udkjax.show.player.marks.mark_kinds import MarkKind
 from udkjax.show.player.marks.marks import Mark
 from udkjax.show.player.marks.sketch import Line, Sketch, Text
@@ -138,7 +139,7 @@ class Placing:
             cost += ON_TEXT * float(np.sum((np.abs(d @ a) <= a @ a) & (np.abs(d @ b) <= b @ b)))
         for bar in self.bars:
             if own is None or (bar is not own and not all(np.allclose(x, y) for x, y in zip(bar, own, strict=True))):
-                cost += ON_LINK * float(np.sum(_distance(places, *bar) < self.size / 2))
+                cost += ON_LINK * float(np.sum(distances_from_segments(places, *np.array(bar)[:, None]) < self.size / 2))
         return cost
 
     def _width(self, words: str) -> float:
@@ -162,10 +163,3 @@ class Placing:
         angle = float(np.degrees(np.arctan2(-along[1], along[0])))
         upright = angle if -90.0 < round(angle, 6) <= 90.0 else angle - 180.0 * np.sign(angle)
         return [*found, Text("dimension", place, words, self.size, colour, upright)]
-
-
-def _distance(places: Float[np.ndarray, "n 2"], start: Pixels, end: Pixels) -> Float[np.ndarray, "n"]:
-    """Return the distances of places from a line between two points."""
-    way = end - start
-    share = np.clip((places - start) @ way / max(float(way @ way), 1e-12), 0.0, 1.0)
-    return np.linalg.norm(places - start - share[:, None] * way, axis=1)
