@@ -279,3 +279,24 @@ def _answers(solution):
 def test_mistakes_in_ranges_are_explained(text, message):
     with pytest.raises(udk.SceneError, match=re.escape(message)):
         read_variation(four_bar("left"), text)
+
+
+def _texts(svg: str) -> list[tuple[str, float, float, float]]:
+    """Return the texts of a figure with their middles and usual widths, some of which have an index."""
+    found = []
+    for x, y, words in re.findall(r'<text x="([\d.-]+)" y="([\d.-]+)"[^>]*>(.*?)</text>', svg):
+        plain = re.sub("<[^>]*>", "", words)
+        found.append((plain, float(x), float(y) - 4.5, 0.58 * 13.0 * len(plain)))
+    return found
+
+
+@pytest.mark.parametrize("name", [*EXERCISES, *TRIADS])
+def test_texts_of_figures_cover_neither_each_other_nor_leave_the_figure(solutions, name, tmp_path):
+    solutions[name].save(tmp_path / "page.html")
+    for svg in re.findall("<svg.*?</svg>", (tmp_path / "page.html").read_text(), re.DOTALL):
+        width, height = (float(x) for x in re.search(r'viewBox="0 0 ([\d.]+) ([\d.]+)"', svg).groups())
+        texts = _texts(svg)
+        for k, (words, x, y, wide) in enumerate(texts):
+            assert wide / 2 - 1 < x < width - wide / 2 + 1 and 6 < y < height - 6, words
+            for other, x2, y2, wide2 in texts[:k]:
+                assert abs(x - x2) > 0.45 * (wide + wide2) or abs(y - y2) > 10.0, (words, other)

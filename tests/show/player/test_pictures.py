@@ -146,7 +146,7 @@ def test_names_and_lengths_are_written(four_bar, tmp_path):
 def test_texts_of_a_picture_cover_no_pin_and_no_other_text(four_bar):
     _, (sketch,) = sketches(udk.animate(four_bar, measures=()), None, 640, "light")
     placing = Placing(labels_of(four_bar, []), sketch)
-    centres = np.array([middle for middle, *_ in placing.boxes])
+    centres = np.array([middle for middle, *_ in placing.texts.boxes])
     apart = np.linalg.norm(centres[:, None] - centres, axis=2) + 99 * np.eye(len(centres))
     assert apart.min() > 10 * placing.pt
     low, high = centres.min(axis=0), centres.max(axis=0)

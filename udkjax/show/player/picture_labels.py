@@ -1,32 +1,27 @@
 """Names of points and lengths of links, written into pictures where they cover least."""
 
-from collections.abc import Callable, Sequence
-from typing import NamedTuple, TypeVar
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from udkjax.scene.mechanism import Mechanism
-from udkjax.segments import distances_from_segments
 from udkjax.show.player.marks.mark_kinds import MarkKind
 from udkjax.show.player.marks.marks import Mark
 from udkjax.show.player.marks.sketch import Line, Sketch, Text
+from udkjax.text_places import Box, TextPlaces
 
-T = TypeVar("T")
 Anchor = tuple[int, float, float]  # a place of a body, by its index; -1 is the ground
 Pixels = Float[np.ndarray, "2"]
-Box = tuple[Pixels, Pixels, Pixels]  # middle, and half of two sides that are at right angles
 
 SIZE = 12.0  # height of letters; all lengths are in units of symbols
-WIDE = 0.58  # usual width of a letter, relative to its height
 PIN = 7.0  # around the centre of a pin that texts keep clear
 LEVELS = (17.0, 31.0, 45.0)  # from a link to its dimension line
 ABOVE = 8.0  # from a dimension line to the middle of its text
 ARROW, ARROW_WIDTH = 7.0, 2.0  # length and half of the width of an arrow
 GAP, BEYOND = 6.0, 4.0  # of an extension line: from the point, and beyond the dimension line
 AROUND = [[9, -12, 0], [9, 14, 0], [-9, -12, 1], [-9, 14, 1], [0, -20, 0.5], [0, 22, 0.5]]  # a pin: shift, and share to the left
-SAMPLES = 9  # places of a text that are tested
-OUTSIDE, ON_TEXT, ON_LINK = 4.0, 2.0, 1.0  # costs of a tested place outside the picture, on other texts, on links
 
 
 class LinkDimension(NamedTuple):
@@ -78,8 +73,9 @@ class Placing:
         self.size = SIZE * self.pt
         self.points = {name: sketch.anchor(*anchor) for name, anchor in labels.names.items()}
         ends = [(d.words, sketch.anchor(*d.start), sketch.anchor(*d.end)) for d in labels.dimensions]
-        self.bars = [(start, end) for _, start, end in ends]
-        self.boxes: list[Box] = [(place, *(PIN * self.pt * np.eye(2))) for place in self.points.values()]
+        pins = [(place, *(PIN * self.pt * np.eye(2))) for place in self.points.values()]
+        bars = [(start, end) for _, start, end in ends]
+        self.texts = TextPlaces(sketch.view.width, sketch.view.height, self.size, pins, bars)
         self.dimensions = [self._dimension(*entry) for entry in ends if np.hypot(*(entry[2] - entry[1])) > 2 * PIN * self.pt]
         self.names = [self._name(name, place) for name, place in self.points.items()]
 
@@ -94,56 +90,22 @@ class Placing:
         middle, own = (start + end) / 2, (start, end)
         inwards = np.mean([*self.points.values(), middle], axis=0) - middle
         sides = (-1.0, 1.0) if inwards @ left > 0 else (1.0, -1.0)
-        half = (self._width(words) / 2 * along, self.size / 2 * left)
+        half = (self.texts.width(words) / 2 * along, self.size / 2 * left)
 
         def box(off: float) -> Box:
             return middle + (off + np.sign(off) * ABOVE * self.pt) * left, *half
 
         offs = [side * level * self.pt for level in LEVELS for side in sides]
-        off = self._cheapest(offs, box, own, lambda off: [start + off * left, end + off * left])
-        self.boxes.append(box(off))
-        self.bars.append((start + off * left, end + off * left))
+        off = self.texts.cheapest(offs, box, own, lambda off: [start + off * left, end + off * left])
+        self.texts.boxes.append(box(off))
+        self.texts.lines.append((start + off * left, end + off * left))
         return PlacedDimension(words, start, end, off)
 
     def _name(self, name: str, place: Pixels) -> Text:
-        wide = self._width(name)
-
-        def box(choice: Sequence[float]) -> Box:
-            dx, dy, share = choice
-            shift = np.array([(0.5 - share) * wide + dx * self.pt, dy * self.pt])
-            return place + shift, np.array([wide / 2, 0.0]), np.array([0.0, self.size / 2])
-
-        found = box(self._cheapest(AROUND, box))
-        self.boxes.append(found)
-        return Text("name", found[0], name, self.size, self.sketch.theme["ink"])
-
-    def _cheapest(
-        self,
-        choices: Sequence[T],
-        box: Callable[[T], Box],
-        own: tuple[Pixels, Pixels] | None = None,
-        more: Callable[[T], list[Pixels]] = lambda _: [],
-    ) -> T:
-        """Return the first choice whose text covers least; `more` are further places that should stay in the picture."""
-        costs = [self._cost(box(choice), own, more(choice)) for choice in choices]
-        return choices[int(np.argmin(costs))]
-
-    def _cost(self, box: Box, own: tuple[Pixels, Pixels] | None, more: list[Pixels]) -> float:
-        middle, u, v = box
-        places = middle + np.array([s * u + t * v for s in np.linspace(-1, 1, SAMPLES) for t in (-1, 0, 1)])
-        limits = np.array([self.sketch.view.width, self.sketch.view.height])
-        outside = np.any((places < 0) | (places > limits), axis=1).sum() + sum(np.any((p < 0) | (p > limits)) for p in more)
-        cost = OUTSIDE * float(outside)
-        for other, a, b in self.boxes:
-            d = places - other
-            cost += ON_TEXT * float(np.sum((np.abs(d @ a) <= a @ a) & (np.abs(d @ b) <= b @ b)))
-        for bar in self.bars:
-            if own is None or (bar is not own and not all(np.allclose(x, y) for x, y in zip(bar, own, strict=True))):
-                cost += ON_LINK * float(np.sum(distances_from_segments(places, *np.array(bar)[:, None]) < self.size / 2))
-        return cost
-
-    def _width(self, words: str) -> float:
-        return WIDE * self.size * len(words)
+        wide = self.texts.width(name)
+        shifts = [((0.5 - share) * wide + dx * self.pt, dy * self.pt) for dx, dy, share in AROUND]
+        found = self.texts.put([place + np.array(shift) for shift in shifts], name)
+        return Text("name", found, name, self.size, self.sketch.theme["ink"])
 
     def _lines(self, dimension: PlacedDimension) -> list[Line | Text]:
         words, start, end, off = dimension

@@ -9,12 +9,18 @@ import numpy as np
 from udkjax.scene.elements.bodies import GROUND
 from udkjax.study.worked.loops import Geometry
 from udkjax.study.worked.terms import NumberStyle
+from udkjax.text_places import TextPlaces
 
 WIDTH, MARGIN = 560.0, 46.0  # of a figure, in its units
 TALLEST = 460.0
 HEAD = 9.0  # length of an arrow's head
 NICE = (1.0, 2.0, 5.0)  # times a power of ten: the scales of polygons
 PER_CM = 37.8  # units of a figure in a centimetre
+LETTERS, BASE = 13.0, 4.5  # height of letters, and the baseline below their middle
+CLEAR, PIN = 4.0, 6.0  # from a line to a text beside it, and around a pin
+FARTHER = 0.0, 14.0, 28.0  # where there is no room beside the line
+SHARES = 0.5, 0.35, 0.65, 0.2, 0.8  # places of a text along a line
+AROUND = (8, -8), (8, 12), (-8, -8), (-8, 12), (0, -14), (0, 24), (14, 2), (-14, 2)  # places of a name around a pin
 
 
 class PolygonSide(NamedTuple):
@@ -46,6 +52,9 @@ class _Frame:
         x, y = self.scale * (np.asarray(point) - self.middle)
         return float(0.5 * self.width + x), float(0.5 * self.height - y)
 
+    def texts(self) -> TextPlaces:
+        return TextPlaces(float(self.width), float(self.height), LETTERS)
+
     def svg(self, parts: Sequence[str], title: str) -> str:
         box = f"0 0 {self.width:.1f} {self.height:.1f}"
         inner = "".join(parts)
@@ -60,28 +69,28 @@ def drawing_figure(geometry: Geometry, style: NumberStyle, names: bool = True) -
         middle, along = geometry.places[start], np.array([np.cos(way), np.sin(way)])
         ends = [middle + s * 0.6 * geometry.extent * along for s in (-0.3, 1.6)]
         parts.append(_line(frame, ends[0], ends[1], "guide"))
+    texts = frame.texts()
+    of_pins = {pin: np.array(frame.at(place)) for pin, place in places.items()}
+    texts.boxes += [(place, *(PIN * np.eye(2))) for place in of_pins.values()]
+    texts.boxes += [(of_pins[pin] + [0.0, 8.0], *(8.0 * np.eye(2))) for pin in drawing.ground if pin in of_pins]
+    pairs = dict.fromkeys(pair for link in drawing.links.values() for pair in link.sides if places.keys() >= set(pair))
+    sides = [(a, b) for a, b in pairs if np.any(places[b] - places[a])]
+    texts.lines += [(of_pins[a], of_pins[b]) for a, b in sides]
     labels = []
     for link in drawing.links.values():
         corners = [places[pin] for pin in link.pins if pin in places]
         path = " ".join(f"{x:.1f},{y:.1f}" for x, y in map(frame.at, corners))
         tag, kind = ("polygon", "link plate") if link.kind == "plate" else ("polyline", "link")
         parts.append(f'<{tag} points="{path}" class="{kind}"/>' if len(corners) > 1 else "")
-        for a, b in link.sides if names else []:
-            arm = places[b] - places[a]
-            if not np.any(arm):
-                continue
-            x, y = frame.at(0.5 * (places[a] + places[b]))
-            across = np.array([-arm[1], arm[0]]) / np.hypot(*arm)
-            text = style.number(float(np.hypot(*arm)), "m")
-            labels.append(
-                f'<text x="{x + 14 * across[0]:.1f}" y="{y - 14 * across[1] + 4:.1f}" text-anchor="middle">{text}</text>'
-            )
+    for a, b in sides if names else []:
+        words = style.number(float(np.hypot(*(places[b] - places[a]))), "m")
+        labels.append(_text(_beside(texts, of_pins[a], of_pins[b], words), words))
     for pin, place in places.items():
         x, y = frame.at(place)
         fixed = pin in drawing.ground
         parts.append(f'<path d="M{x:.1f},{y:.1f}l-8,13h16z" class="fixed"/>' if fixed else "")
         parts.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="4" class="pin"/>')
-        labels.append(f'<text x="{x + 8:.1f}" y="{y - 8:.1f}">{escape(pin)}</text>')
+        labels.append(_text(_around(texts, of_pins[pin], pin), escape(pin)))
     return frame.svg([*parts, *labels], "the drawing in this position")
 
 
@@ -110,9 +119,11 @@ def polygon_figure(sides: Sequence[PolygonSide], style: NumberStyle, unit: str, 
     power = 10.0 ** np.floor(np.log10(per_cm))
     nice = next((k * power for k in NICE if k * power >= per_cm * (1 - 1e-9)), 10 * power)
     frame = _Frame(points, PER_CM / (nice * shown))
-    parts = [_arrow(frame, side) for side in sides]
-    x, y = frame.at(np.zeros(2))
-    parts.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3" class="pin"/><text x="{x - 14:.1f}" y="{y + 16:.1f}">o</text>')
+    texts, pole = frame.texts(), np.array(frame.at(np.zeros(2)))
+    texts.lines += [(np.array(frame.at(side.start)), np.array(frame.at(side.end))) for side in sides]
+    texts.boxes.append((pole, *(PIN * np.eye(2))))
+    parts = [_arrow(frame, side, texts) for side in sides]
+    parts.append(f'<circle cx="{pole[0]:.1f}" cy="{pole[1]:.1f}" r="3" class="pin"/>{_text(_around(texts, pole, "o"), "o")}')
     caption = f"{title}; 1 cm is {nice:g} {style.unit(unit)}"
     svg = frame.svg(parts, title).replace("<svg ", f'<svg style="width:{frame.width / PER_CM:.2f}cm" ', 1)
     return f'<figure class="scaled">{svg}<figcaption>{escape(caption)}.</figcaption></figure>'
@@ -123,7 +134,26 @@ def _line(frame: _Frame, start: np.ndarray, end: np.ndarray, kind: str) -> str:
     return f'<line x1="{x1:.1f}" y1="{y1:.1f}" x2="{x2:.1f}" y2="{y2:.1f}" class="{kind}"/>'
 
 
-def _arrow(frame: _Frame, side: PolygonSide) -> str:
+def _beside(texts: TextPlaces, start: np.ndarray, end: np.ndarray, words: str) -> np.ndarray:
+    """Return the middle of a text beside a line."""
+    way = end - start
+    across = np.array([way[1], -way[0]]) / np.hypot(*way)
+    off = CLEAR + 0.5 * (texts.width(words) * abs(across[0]) + LETTERS * abs(across[1]))
+    offs = [side * (off + far) for far in FARTHER for side in (1, -1)]
+    return texts.put([start + share * way + x * across for x in offs for share in SHARES], words)
+
+
+def _around(texts: TextPlaces, place: np.ndarray, words: str) -> np.ndarray:
+    """Return the middle of a name around a point."""
+    half = 0.5 * texts.width(words)
+    return texts.put([place + [dx + np.sign(dx) * half, dy - BASE] for dx, dy in AROUND], words)
+
+
+def _text(middle: np.ndarray, words: str) -> str:
+    return f'<text x="{middle[0]:.1f}" y="{middle[1] + BASE:.1f}" text-anchor="middle">{words}</text>'
+
+
+def _arrow(frame: _Frame, side: PolygonSide, texts: TextPlaces) -> str:
     (x1, y1), (x2, y2) = frame.at(side.start), frame.at(side.end)
     way = np.array([x2 - x1, y2 - y1])
     length = float(np.hypot(*way))
@@ -134,9 +164,8 @@ def _arrow(frame: _Frame, side: PolygonSide) -> str:
     corners = [np.array([x2, y2]), base + 3.2 * across, base - 3.2 * across]
     head = " ".join(f"{x:.1f},{y:.1f}" for x, y in corners)
     letter, _, index = side.name.partition("_")
-    x, y = 0.5 * (x1 + x2) + 13 * across[0], 0.5 * (y1 + y2) + 13 * across[1] + 4
     label = f'{escape(letter)}<tspan dy="4" font-size="10">{escape(index)}</tspan>'
+    middle = _beside(texts, np.array([x1, y1]), np.array([x2, y2]), letter + index)
+    name = _text(middle - [0.0, 2.0], label)  # the index is lower
     line = f'<line x1="{x1:.1f}" y1="{y1:.1f}" x2="{base[0]:.1f}" y2="{base[1]:.1f}" class="{side.kind}"/>'
-    return (
-        f'{line}<polygon points="{head}" class="{side.kind}"/><text x="{x:.1f}" y="{y:.1f}" text-anchor="middle">{label}</text>'
-    )
+    return f'{line}<polygon points="{head}" class="{side.kind}"/>{name}'

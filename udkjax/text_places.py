@@ -1,0 +1,79 @@
+"""Places of texts in a picture: one after another, each where it covers least of other texts and of lines."""
+
+from collections.abc import Callable, Sequence
+from typing import TypeVar
+
+import numpy as np
+from jaxtyping import Float
+
+from udkjax.segments import distances_from_segments
+
+T = TypeVar("T")
+Place = Float[np.ndarray, "2"]
+Box = tuple[Place, Place, Place]  # middle, and half of two sides that are at right angles
+Segment = tuple[Place, Place]
+
+WIDE = 0.58  # usual width of a letter, relative to its height
+SAMPLES = 9  # places of a text that are tested
+OUTSIDE, ON_TEXT, ON_LINE = 4.0, 2.0, 1.0  # costs of a tested place outside the picture, on other texts, on lines
+
+
+class TextPlaces:
+    """The texts of a picture so far, and its lines.
+
+    Args:
+        width: of the picture, in its units, from zero.
+        height: of the picture.
+        size: height of letters.
+        boxes: boxes that texts keep clear.
+        lines: lines that texts keep clear.
+    """
+
+    def __init__(self, width: float, height: float, size: float, boxes: Sequence[Box] = (), lines: Sequence[Segment] = ()):
+        self.limits, self.size = np.array([width, height]), size
+        self.boxes, self.lines = list(boxes), list(lines)
+
+    def width(self, words: str) -> float:
+        """Return the usual width of a text."""
+        return WIDE * self.size * len(words)
+
+    def level(self, middle: Place, words: str) -> Box:
+        """Return the box of a text that is written along x."""
+        return middle, np.array([self.width(words) / 2, 0.0]), np.array([0.0, self.size / 2])
+
+    def cheapest(
+        self,
+        choices: Sequence[T],
+        box: Callable[[T], Box],
+        own: Segment | None = None,
+        more: Callable[[T], Sequence[Place]] = lambda _: (),
+    ) -> T:
+        """Return the first choice whose text covers least.
+
+        Args:
+            choices: choices, the best first.
+            box: the box of the text of a choice.
+            own: a line that the text may cover.
+            more: further places of a choice that should be in the picture.
+        """
+        costs = [self._cost(box(choice), own, more(choice)) for choice in choices]
+        return choices[int(np.argmin(costs))]
+
+    def put(self, choices: Sequence[Place], words: str) -> Place:
+        """Return the first of several middles of a text along x at which it covers least, and keep its box clear."""
+        found = self.cheapest(choices, lambda middle: self.level(middle, words))
+        self.boxes.append(self.level(found, words))
+        return found
+
+    def _cost(self, box: Box, own: Segment | None, more: Sequence[Place]) -> float:
+        middle, u, v = box
+        places = middle + np.array([s * u + t * v for s in np.linspace(-1, 1, SAMPLES) for t in (-1, 0, 1)])
+        outside = np.any((places < 0) | (places > self.limits), axis=1).sum()
+        cost = OUTSIDE * float(outside + sum(np.any((p < 0) | (p > self.limits)) for p in more))
+        for other, a, b in self.boxes:
+            d = places - other
+            cost += ON_TEXT * float(np.sum((np.abs(d @ a) <= a @ a) & (np.abs(d @ b) <= b @ b)))
+        for line in self.lines:
+            if own is None or (line is not own and not all(np.allclose(x, y) for x, y in zip(line, own, strict=True))):
+                cost += ON_LINE * float(np.sum(distances_from_segments(places, *np.array(line)[:, None]) < self.size / 2))
+        return cost
