@@ -17,7 +17,7 @@ ROOT = Path(udkjax.__file__).parent
 
 # every floor may import them
 GROUND_FLOOR = {"annotations", "arrays", "devices", "extras", "folders", "lazy_names", "printing", "progress"}
-GROUND_FLOOR |= {"argument_types", "requirements", "segments", "threads", "wording"}
+GROUND_FLOOR |= {"argument_types", "requirements", "segments", "text_places", "threads", "wording"}
 PROGRAMS = {"expressions", "programs"}
 EQUATIONS = PROGRAMS | {"complementarity", "pinv", "scene", "transforms", "equations"}
 POSITIONS = EQUATIONS | {"native", "positions"}

@@ -9,9 +9,9 @@ from jaxtyping import Float
 from udkjax.segments import distances_from_segments
 
 T = TypeVar("T")
-Place = Float[np.ndarray, "2"]
-Box = tuple[Place, Place, Place]  # middle, and half of two sides that are at right angles
-Segment = tuple[Place, Place]
+PagePoint = Float[np.ndarray, "2"]
+Box = tuple[PagePoint, PagePoint, PagePoint]  # middle, and half of two sides that are at right angles
+Segment = tuple[PagePoint, PagePoint]
 
 WIDE = 0.58  # usual width of a letter, relative to its height
 SAMPLES = 9  # places of a text that are tested
@@ -37,7 +37,7 @@ class TextPlaces:
         """Return the usual width of a text."""
         return WIDE * self.size * len(words)
 
-    def level(self, middle: Place, words: str) -> Box:
+    def level(self, middle: PagePoint, words: str) -> Box:
         """Return the box of a text that is written along x."""
         return middle, np.array([self.width(words) / 2, 0.0]), np.array([0.0, self.size / 2])
 
@@ -46,7 +46,7 @@ class TextPlaces:
         choices: Sequence[T],
         box: Callable[[T], Box],
         own: Segment | None = None,
-        more: Callable[[T], Sequence[Place]] = lambda _: (),
+        more: Callable[[T], Sequence[PagePoint]] = lambda _: (),
     ) -> T:
         """Return the first choice whose text covers least.
 
@@ -59,13 +59,13 @@ class TextPlaces:
         costs = [self._cost(box(choice), own, more(choice)) for choice in choices]
         return choices[int(np.argmin(costs))]
 
-    def put(self, choices: Sequence[Place], words: str) -> Place:
+    def put(self, choices: Sequence[PagePoint], words: str) -> PagePoint:
         """Return the first of several middles of a text along x at which it covers least, and keep its box clear."""
         found = self.cheapest(choices, lambda middle: self.level(middle, words))
         self.boxes.append(self.level(found, words))
         return found
 
-    def _cost(self, box: Box, own: Segment | None, more: Sequence[Place]) -> float:
+    def _cost(self, box: Box, own: Segment | None, more: Sequence[PagePoint]) -> float:
         middle, u, v = box
         places = middle + np.array([s * u + t * v for s in np.linspace(-1, 1, SAMPLES) for t in (-1, 0, 1)])
         outside = np.any((places < 0) | (places > self.limits), axis=1).sum()
@@ -77,3 +77,10 @@ class TextPlaces:
             if own is None or (line is not own and not all(np.allclose(x, y) for x, y in zip(line, own, strict=True))):
                 cost += ON_LINE * float(np.sum(distances_from_segments(places, *np.array(line)[:, None]) < self.size / 2))
         return cost
+
+
+def _distance(places: Float[np.ndarray, "n 2"], start: PagePoint, end: PagePoint) -> Float[np.ndarray, "n"]:
+    """Return the distances of places from a line between two points."""
+    way = end - start
+    share = np.clip((places - start) @ way / max(float(way @ way), 1e-12), 0.0, 1.0)
+    return np.linalg.norm(places - start - share[:, None] * way, axis=1)

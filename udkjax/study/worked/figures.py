@@ -17,8 +17,8 @@ HEAD = 9.0  # length of an arrow's head
 NICE = (1.0, 2.0, 5.0)  # times a power of ten: the scales of polygons
 PER_CM = 37.8  # units of a figure in a centimetre
 LETTERS, BASE = 13.0, 4.5  # height of letters, and the baseline below their middle
-CLEAR, PIN = 4.0, 6.0  # from a line to a text beside it, and around a pin
-FARTHER = 0.0, 14.0, 28.0  # where there is no room beside the line
+CLEAR, PIN = 4.0, 6.0  # from a line to its text, and around a pin
+FARTHER = 0.0, 14.0, 28.0  # farther from the line, where there is no room next to it
 SHARES = 0.5, 0.35, 0.65, 0.2, 0.8  # places of a text along a line
 AROUND = (8, -8), (8, 12), (-8, -8), (-8, 12), (0, -14), (0, 24), (14, 2), (-14, 2)  # places of a name around a pin
 
