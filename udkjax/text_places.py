@@ -77,10 +77,3 @@ class TextPlaces:
             if own is None or (line is not own and not all(np.allclose(x, y) for x, y in zip(line, own, strict=True))):
                 cost += ON_LINE * float(np.sum(distances_from_segments(places, *np.array(line)[:, None]) < self.size / 2))
         return cost
-
-
-def _distance(places: Float[np.ndarray, "n 2"], start: PagePoint, end: PagePoint) -> Float[np.ndarray, "n"]:
-    """Return the distances of places from a line between two points."""
-    way = end - start
-    share = np.clip((places - start) @ way / max(float(way @ way), 1e-12), 0.0, 1.0)
-    return np.linalg.norm(places - start - share[:, None] * way, axis=1)
