@@ -6,6 +6,7 @@ import svgelements
 from udkjax.synthesis.curves.curve_file import FRACTIONS
 from udkjax.synthesis.curves.dyad_forms import PINS
 from udkjax.synthesis.curves.dyads import BASE, EACH, HEAD, SECOND, Topology, number_count, positions
+from udkjax.synthesis.curves.targets import as_points
 
 LETTERS = {
     "A": "M0 6 L2 0 L4 6 L3.2 3.6 H0.8",
@@ -54,17 +55,17 @@ def classic_curves() -> dict[str, np.ndarray]:
     arc, sweep = np.linspace(-0.6, 0.6, 120), np.linspace(-np.pi / 4, 5 * np.pi / 4, 160)
     star = np.exp(1j * (np.pi / 2 + np.arange(10) * np.pi / 5)) * np.where(np.arange(10) % 2, 0.45, 1.0)
     return {
-        "straight line": _points(np.linspace(0.0, 1.0, 50) + 0j),
-        "line and return": _points(np.concatenate([np.linspace(-1.0, 1.0, 80) + 0j, np.cos(t[:120]) + 0.5j * np.sin(t[:120])])),
-        "arc": _points(1j * np.exp(1j * arc)),
-        "horseshoe": _points(np.exp(1j * sweep)),
-        "figure eight": _points(np.sin(t) + 0.5j * np.sin(2 * t)),
-        "heart": _points(16 * np.sin(t) ** 3 + 1j * (13 * np.cos(t) - 5 * np.cos(2 * t) - 2 * np.cos(3 * t) - np.cos(4 * t))),
-        "star": _points(np.append(star, star[0])),
-        "step of a leg": _points(
+        "straight line": as_points(np.linspace(0.0, 1.0, 50) + 0j),
+        "line and return": as_points(np.concatenate([np.linspace(-1.0, 1.0, 80) + 0j, np.cos(t[:120]) + 0.5j * np.sin(t[:120])])),
+        "arc": as_points(1j * np.exp(1j * arc)),
+        "horseshoe": as_points(np.exp(1j * sweep)),
+        "figure eight": as_points(np.sin(t) + 0.5j * np.sin(2 * t)),
+        "heart": as_points(16 * np.sin(t) ** 3 + 1j * (13 * np.cos(t) - 5 * np.cos(2 * t) - 2 * np.cos(3 * t) - np.cos(4 * t))),
+        "star": as_points(np.append(star, star[0])),
+        "step of a leg": as_points(
             np.concatenate([np.linspace(1.0, -1.0, 100) + 0j, -np.cos(t[:120]) + 0.7j * np.sin(t[:120]) ** 2])
         ),
-        "trefoil": _points(np.sin(t) + 2 * np.sin(2 * t) + 1j * (np.cos(t) - 2 * np.cos(2 * t))),
+        "trefoil": as_points(np.sin(t) + 2 * np.sin(2 * t) + 1j * (np.cos(t) - 2 * np.cos(2 * t))),
         "square": points_of_path("M0 0 H1 V1 H0 Z"),
     }
 
@@ -89,9 +90,5 @@ def curves_of_mechanisms(count: int, rng: np.random.Generator) -> list[np.ndarra
             0.0,
         )
         if np.abs(at.cosines).max() < np.cos(np.deg2rad(10.0)) and np.ptp(np.real(at.pin)) > 0.1:
-            curves.append(_points(at.pin[0, :-1]))
+            curves.append(as_points(at.pin[0, :-1]))
     return curves
-
-
-def _points(z: np.ndarray) -> np.ndarray:
-    return np.stack([np.real(z), np.imag(z)], 1)
