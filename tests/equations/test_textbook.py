@@ -143,6 +143,15 @@ def test_weights_change_no_solution_of_consistent_rows_and_zero_leaves_one_out()
     assert without["lambda"][11] == 0.0 and np.abs(plain["lambda"][11]) > 1.0
 
 
+@pytest.mark.parametrize("symbol", [uk.accelerations, uk.multipliers])
+def test_an_equation_computes_psi_q_and_the_loads_once(symbol):
+    """Programs of derivatives have copies of each, and take as long to compile as they have operations."""
+    mech = udk.library.four_bar()
+    program = jax.make_jaxpr(lambda q, v: symbol(mech, 0.0, q, v, SVD))(mech.q0.ravel(), mech.v0.ravel())
+    called = [equation.params.get("name") for equation in program.eqns]
+    assert [called.count(name) for name in ("psi_q", "force", "gamma")] == [1, 1, 1]
+
+
 @pytest.mark.parametrize("name", ["parallelogram", "slider_crank"])
 def test_projection_returns_to_the_manifold_and_leaves_what_is_tangent_to_it(name):
     mech = scene(name)
