@@ -102,7 +102,7 @@ def test_a_file_gives_a_curve_in_its_unit(tmp_path):
 
 @pytest.mark.parametrize(
     ("given", "message"),
-    [(([[0, 0], [1, 1]],), "at least 3 points"), ((CORNER, "half"), "part"), ((CORNER, "free", 2), "samples")],
+    [(([[0, 0], [1, 1]],), "^points must have at least 3 points"), ((CORNER, "half"), "part"), ((CORNER, "free", 2), "samples")],
 )
 def test_goals_with_mistakes_are_refused(given, message):
     with pytest.raises(ValueError, match=message):

@@ -59,7 +59,7 @@ class CurveGoal(Goal):
         require_text("pin", pin)
         require_choice("part", part, ("free", "whole"))
         require_count("samples", samples, 3)
-        wanted = WantedCurve(points, part == "whole")
+        wanted = WantedCurve(points, part == "whole", "points")
         self.pin, self.part, self.samples, self.start, self.line = pin, part, samples, "free", ()
         self.points = np.asarray(points, float)
         self.is_whole, self.scale, self._middle = wanted.is_whole, wanted.scale, wanted.middle

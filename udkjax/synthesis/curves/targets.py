@@ -14,23 +14,25 @@ CLOSED = 0.02  # a curve whose ends are nearer, relative to its length, is close
 SPACING, SPACED = 1.25, 12  # so is one of at least so many points whose ends are nearer than their usual distance, times this
 
 
-def read_curve(curve: object) -> np.ndarray:
-    """Return the points (n, 2) of a curve (m) without repetitions.
+def read_curve(curve: object, name: str = "curve") -> np.ndarray:
+    """Return the points (n, 2) of a curve (m) without repetitions; `name` is that of the argument.
 
     Raises:
         ValueError: they are not finite points, there are fewer than three, or all coincide, or squares of numbers would overflow.
     """
-    require_finite("curve", curve)
+    require_finite(name, curve)
     points = np.asarray(curve, float)
     if points.ndim != 2 or points.shape[1] != 2:
-        raise ValueError(f"curve must have the shape (n, 2), one row x, y for each point, not {points.shape}")
+        raise ValueError(f"{name} must have the shape (n, 2), one row x, y for each point, not {points.shape}")
     if len(points) < FEWEST:
-        raise ValueError(f"curve must have at least {FEWEST} points, not {len(points)}")
+        raise ValueError(f"{name} must have at least {FEWEST} points, not {len(points)}")
     size = float(np.hypot(*np.ptp(points, axis=0)))
     if not size > 4 * np.finfo(float).eps * np.abs(points).max():
-        raise ValueError("curve has no size: all of its points coincide")
+        raise ValueError(f"{name} has no size: all of its points coincide")
     if not 1.0 / LARGEST < size < LARGEST:
-        raise ValueError(f"curve has an extent of {size:.3g} m: give it in another unit, between {1 / LARGEST:g} and {LARGEST:g}")
+        raise ValueError(
+            f"{name} has an extent of {size:.3g} m: give it in another unit, between {1 / LARGEST:g} and {LARGEST:g}"
+        )
     step = np.linalg.norm(np.diff(points, axis=0), axis=1)
     return points[np.concatenate([[True], step > np.finfo(float).eps * size])]
 
@@ -84,10 +86,11 @@ class WantedCurve:
     Args:
         curve: points (n, 2) (m).
         whole: whether the whole turn of the crank draws it, even if it is open.
+        name: the name of the argument, for messages.
     """
 
-    def __init__(self, curve: object, whole: bool = False):
-        given = read_curve(curve)
+    def __init__(self, curve: object, whole: bool = False, name: str = "curve"):
+        given = read_curve(curve, name)
         self.is_closed = closes(given)
         self.is_whole = self.is_closed or whole
         z = resampled(given, CHAMFER_POINTS, self.is_closed)
