@@ -2,6 +2,7 @@
 
 from importlib import import_module
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -496,6 +497,40 @@ def test_the_workspace_of_two_links_is_a_ring():
     length = float(np.linalg.norm(np.asarray(pin[0]) - np.asarray(foot[1])))
     angle = (base[1] + second)[None, :] - (base[0] + first)[:, None]
     np.testing.assert_allclose(radius, np.sqrt(length**2 + arm**2 + 2 * length * arm * np.cos(angle)), atol=1e-12)
+
+
+def test_the_violation_along_values_is_that_of_the_driven_mechanism():
+    """Values are not times, at which a driver would be elsewhere; other drivers hold their values."""
+    crank, values = udk.library.slider_crank(0.3, 4.0), np.linspace(0.3, 6.5, 9)
+    arm = dict(zip("ab", two_motors().drivers, strict=True))
+    cases = [
+        (crank, udk.kinematics(crank, "motor", values)),
+        (crank, udk.kinematics(crank, None, values)),
+        (udk.library.four_bar(), udk.kinematics(udk.library.four_bar(), "body.crank.angle", values)),
+        (two_motors(), udk.kinematics(two_motors(), arm["a"], [0.1, 0.5, 0.9], held={arm["b"]: 0.7})),
+    ]
+    for mech, motion in cases:
+        assert np.abs(udk.violation(mech, motion)).max() < 1e-12
+        off = eqx.tree_at(
+            lambda m: m.q, motion, motion.q.at[1:].add(1e-3 * np.arange(motion.q[1:].size).reshape(motion.q[1:].shape))
+        )
+        assert np.abs(udk.violation(mech, off)).max() > 1e-4
+    traced = jax.jit(lambda a: udk.violation(crank, udk.kinematics(crank, "motor", a + values)))(0.1)
+    assert np.abs(traced).max() < 1e-12
+
+
+def two_motors():
+    """Two links in a chain, each turned by a motor of its own whose speed is not constant."""
+    bodies = {"upper": udk.Body(1.0, 0.1, (0.5, 0.0)), "lower": udk.Body(1.0, 0.1, (1.5, 0.0))}
+    joints = {
+        "A": udk.Revolute(("ground", "upper"), ((0, 0), (-0.5, 0))),
+        "B": udk.Revolute(("upper", "lower"), ((0.5, 0), (-0.5, 0))),
+    }
+    motion = udk.Polynomial((0.0, 0.0, 3.0))
+    drivers = {
+        name: udk.Driver(joint.bodies, "angle", motion) for name, joint in zip(("first", "second"), joints.values(), strict=True)
+    }
+    return udk.Mechanism(bodies, joints, drivers)
 
 
 def test_what_cannot_be_driven_is_refused():

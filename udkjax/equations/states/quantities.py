@@ -165,15 +165,40 @@ def violation(mechanism: Mechanism | ConstrainedSystem, solution: Annotated[Hist
 
     Returns:
         Psi (T, m), in m or rad: the rows of the joints in their order, then those of the drivers. For a `ConstrainedSystem` the
-        rows of Psi, then those of phi. Rows of a constraint are zero while events of a `Solution` have released it.
+        rows of Psi, then those of phi. Rows of a constraint are zero while events of a `Solution` have released it. Along a
+        `Kinematics` over the values of a driver, its row is the coordinate minus the value, and the rows of all other drivers
+        are the changes of what they hold.
     """
     changes: SceneChanges | None = getattr(solution, "scene_changes", None)
-    if by_numpy(mechanism, (solution.ts, solution.q)):
-        ts, q = history_of(solution)[:2]
+    driver: str | None = getattr(solution, "values_of", None)
+    states = solution if driver is None else _States(0.0 * solution.ts, solution.q, solution.v)
+    if by_numpy(mechanism, (states.ts, states.q)):
+        ts, q = history_of(states)[:2]
         psi = jax.device_put(state_arrays(mechanism.without_origin).psi(ts, q))
     else:
-        psi = _evaluate_along(mechanism, solution, _residuals)
+        psi = _evaluate_along(mechanism, states, _residuals)
+    if driver is not None and mechanism.has_bodies and mechanism.drivers:
+        return _over_values(mechanism, psi, driver, solution.ts)
     return psi if changes is None else jnp.where(changes.rows_that_hold(mechanism), psi, 0.0)
+
+
+class _States(NamedTuple):
+    """States at times."""
+
+    ts: Any
+    q: Any
+    v: Any
+
+
+def _over_values(mechanism: Mechanism, psi: Float[Array, "T m"], driver: str, values: Any) -> Float[Array, "T m"]:
+    """Return Psi along values of a driver, from that at time 0: the last rows are those of the drivers."""
+    names = mechanism.driver_names
+    rows = psi[:, -len(names) :]
+    change = rows - rows[jnp.argmax(jnp.isfinite(rows).all(1))]
+    if driver in names:
+        k = names.index(driver)
+        change = change.at[:, k].set(rows[:, k] + mechanism.drivers[driver].motion(0.0) - values)
+    return psi.at[:, -len(names) :].set(change)
 
 
 @checked

@@ -49,6 +49,7 @@ class Kinematics(PrintsTable):
         limit: the value at the toggle that ended the motion; infinite without one.
         limit_q: the position at that toggle; infinite without one.
         bodies: the names of the bodies, in the order of q.
+        values_of: the name of the driver that has these values, "value" for a coordinate without one; None: they are times.
     """
 
     values: Float[Array, "T"]  # values of the driver (rad, m), or times (s)
@@ -61,6 +62,7 @@ class Kinematics(PrintsTable):
     limit_q: Float[Array, "bodies 3"]
     bodies: tuple[str, ...] = eqx.field(static=True)
     unit: str = eqx.field(static=True, default="")  # unit of the values
+    values_of: str | None = eqx.field(static=True, default=None)  # None: they are times
 
     _units = units(q="m, m, rad", v="m/s, m/s, rad/s", a="m/s², m/s², rad/s²", limit_q="m, m, rad")
 
@@ -278,6 +280,7 @@ def _kinematics(
         limit_q=limit_q,
         bodies=bodies,
         unit=unit,
+        values_of=driven.name or None,
     )
 
 
