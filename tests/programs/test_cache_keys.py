@@ -127,7 +127,7 @@ PAIRS = {
 }
 ELSEWHERE = {  # tested with their own subjects: they are no numbers of a scene, or of drawings, whose elements are compared above
     "Augmented", "CoordinatePartitioning", "Verner65", "Coordinate", "PinMotion", "Solution", "ConstrainedSystem", "Candidate",
-    "Parameter", "Start", "Effort", "Link", "Cam", "LiftProfile", "SwingProfile",
+    "Parameter", "Start", "Effort", "Link", "Cam", "LiftProfile", "SwingProfile", "Kinematics", "LeastGaps",
 }  # fmt: skip
 
 
