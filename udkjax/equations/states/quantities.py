@@ -167,7 +167,7 @@ def violation(mechanism: Mechanism | ConstrainedSystem, solution: Annotated[Hist
         Psi (T, m), in m or rad: the rows of the joints in their order, then those of the drivers. For a `ConstrainedSystem` the
         rows of Psi, then those of phi. Rows of a constraint are zero while events of a `Solution` have released it. Along a
         `Kinematics` over the values of a driver, its row is the coordinate minus the value, and the rows of all other drivers
-        are the changes of what they hold.
+        are the changes of their coordinates, which they hold.
     """
     changes: SceneChanges | None = getattr(solution, "scene_changes", None)
     driver: str | None = getattr(solution, "values_of", None)
