@@ -177,7 +177,7 @@ def violation(mechanism: Mechanism | ConstrainedSystem, solution: Annotated[Hist
         psi = jax.device_put(state_arrays(mechanism.without_origin).psi(ts, q))
     else:
         psi = _evaluate_along(mechanism, states, _residuals)
-    if driver is not None and mechanism.has_bodies and mechanism.drivers:
+    if driver is not None and isinstance(mechanism, Mechanism) and mechanism.drivers:
         return _over_values(mechanism, psi, driver, solution.ts)
     return psi if changes is None else jnp.where(changes.rows_that_hold(mechanism), psi, 0.0)
 

@@ -68,7 +68,7 @@ def drawing_of(x: np.ndarray, topology: Topology, wanted: WantedCurve, name: str
     links = {_link_name(k): _link(members[k], places, wanted.extent, size) for k in sorted(members) if k}
     written = {pin: (z.real, z.imag) for pin, z in places.items()}
     slides = []
-    for d in np.flatnonzero(topology.form[0] != PINS):
+    for d in np.flatnonzero(topology.form[0] != PINS).tolist():
         on = int(topology.second[0, d]) if topology.form[0, d] == RAIL else BASE + 2 * d
         turn = complex(at.turns[BASE + 2 * d + 1, 0, 0])
         slides.append({"link": _link_name(BASE + 2 * d + 1), "direction": (turn.real, turn.imag), "on": _link_name(on)})

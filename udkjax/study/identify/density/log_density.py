@@ -200,7 +200,7 @@ class InferenceProblem:
             return jax.lax.map(each, batches).reshape(-1)[: len(x)]
 
         compiled = self.compiled("densities", densities)
-        if is_traced(x) or len(x) <= PART:
+        if is_traced(x) or np.shape(x)[0] <= PART:
             return compiled(x)
         points = np.asarray(x, float)
         parts = np.pad(points, ((0, -len(points) % PART), (0, 0)), mode="edge").reshape(-1, PART, points.shape[1])
