@@ -177,7 +177,7 @@ def violation(mechanism: Mechanism | ConstrainedSystem, solution: Annotated[Hist
         psi = jax.device_put(state_arrays(mechanism.without_origin).psi(ts, q))
     else:
         psi = _evaluate_along(mechanism, states, _residuals)
-    if driver is not None and isinstance(mechanism, Mechanism) and mechanism.drivers:
+    if driver is not None and mechanism.has_bodies:
         return _over_values(mechanism, psi, driver, solution.ts)
     return psi if changes is None else jnp.where(changes.rows_that_hold(mechanism), psi, 0.0)
 
@@ -190,9 +190,11 @@ class _States(NamedTuple):
     v: Any
 
 
-def _over_values(mechanism: Mechanism, psi: Float[Array, "T m"], driver: str, values: Any) -> Float[Array, "T m"]:
+def _over_values(mechanism: Any, psi: Float[Array, "T m"], driver: str, values: Any) -> Float[Array, "T m"]:
     """Return Psi along values of a driver, from that at time 0: the last rows are those of the drivers."""
     names = mechanism.driver_names
+    if not names:
+        return psi
     rows = psi[:, -len(names) :]
     change = rows - rows[jnp.argmax(jnp.isfinite(rows).all(1))]
     if driver in names:
