@@ -15,6 +15,7 @@ Segment = tuple[PagePoint, PagePoint]
 
 WIDE = 0.58  # usual width of a letter, relative to its height
 SAMPLES = 9  # places of a text that are tested
+AROUND = [[9, -12, 0], [9, 14, 0], [-9, -12, 1], [-9, 14, 1], [0, -20, 0.5], [0, 22, 0.5]]  # a pin: shift, and share to the left
 OUTSIDE, ON_TEXT, ON_LINE = 4.0, 2.0, 1.0  # costs of a tested place outside the picture, on other texts, on lines
 
 
@@ -64,6 +65,12 @@ class TextPlaces:
         found = self.cheapest(choices, lambda middle: self.level(middle, words))
         self.boxes.append(self.level(found, words))
         return found
+
+    def put_around(self, place: PagePoint, words: str, unit: float = 1.0) -> PagePoint:
+        """Return the middle of a name around a pin, with shifts in a unit of length, and keep its box clear."""
+        wide = self.width(words)
+        shifts = [((0.5 - share) * wide + dx * unit, dy * unit) for dx, dy, share in AROUND]
+        return self.put([place + np.array(shift) for shift in shifts], words)
 
     def _cost(self, box: Box, own: Segment | None, more: Sequence[PagePoint]) -> float:
         middle, u, v = box

@@ -21,7 +21,6 @@ LEVELS = (17.0, 31.0, 45.0)  # from a link to its dimension line
 ABOVE = 8.0  # from a dimension line to the middle of its text
 ARROW, ARROW_WIDTH = 7.0, 2.0  # length and half of the width of an arrow
 GAP, BEYOND = 6.0, 4.0  # of an extension line: from the point, and beyond the dimension line
-AROUND = [[9, -12, 0], [9, 14, 0], [-9, -12, 1], [-9, 14, 1], [0, -20, 0.5], [0, 22, 0.5]]  # a pin: shift, and share to the left
 
 
 class LinkDimension(NamedTuple):
@@ -102,9 +101,7 @@ class Placing:
         return PlacedDimension(words, start, end, off)
 
     def _name(self, name: str, place: Pixels) -> Text:
-        wide = self.texts.width(name)
-        shifts = [((0.5 - share) * wide + dx * self.pt, dy * self.pt) for dx, dy, share in AROUND]
-        found = self.texts.put([place + np.array(shift) for shift in shifts], name)
+        found = self.texts.put_around(place, name, self.pt)
         return Text("name", found, name, self.size, self.sketch.theme["ink"])
 
     def _lines(self, dimension: PlacedDimension) -> list[Line | Text]:

@@ -20,7 +20,6 @@ LETTERS, BASE = 13.0, 4.5  # height of letters, and the baseline below their mid
 CLEAR, PIN = 4.0, 6.0  # from a line to its text, and around a pin
 FARTHER = 0.0, 14.0, 28.0  # farther from the line, where there is no room next to it
 SHARES = 0.5, 0.35, 0.65, 0.2, 0.8  # places of a text along a line
-AROUND = (8, -8), (8, 12), (-8, -8), (-8, 12), (0, -14), (0, 24), (14, 2), (-14, 2)  # places of a name around a pin
 
 
 class PolygonSide(NamedTuple):
@@ -90,7 +89,7 @@ def drawing_figure(geometry: Geometry, style: NumberStyle, names: bool = True) -
         fixed = pin in drawing.ground
         parts.append(f'<path d="M{x:.1f},{y:.1f}l-8,13h16z" class="fixed"/>' if fixed else "")
         parts.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="4" class="pin"/>')
-        labels.append(_text(_around(texts, of_pins[pin], pin), escape(pin)))
+        labels.append(_text(texts.put_around(of_pins[pin], pin), escape(pin)))
     return frame.svg([*parts, *labels], "the drawing in this position")
 
 
@@ -123,7 +122,7 @@ def polygon_figure(sides: Sequence[PolygonSide], style: NumberStyle, unit: str, 
     texts.lines += [(np.array(frame.at(side.start)), np.array(frame.at(side.end))) for side in sides]
     texts.boxes.append((pole, *(PIN * np.eye(2))))
     parts = [_arrow(frame, side, texts) for side in sides]
-    parts.append(f'<circle cx="{pole[0]:.1f}" cy="{pole[1]:.1f}" r="3" class="pin"/>{_text(_around(texts, pole, "o"), "o")}')
+    parts.append(f'<circle cx="{pole[0]:.1f}" cy="{pole[1]:.1f}" r="3" class="pin"/>{_text(texts.put_around(pole, "o"), "o")}')
     caption = f"{title}; 1 cm is {nice:g} {style.unit(unit)}"
     svg = frame.svg(parts, title).replace("<svg ", f'<svg style="width:{frame.width / PER_CM:.2f}cm" ', 1)
     return f'<figure class="scaled">{svg}<figcaption>{escape(caption)}.</figcaption></figure>'
@@ -141,12 +140,6 @@ def _beside(texts: TextPlaces, start: np.ndarray, end: np.ndarray, words: str) -
     off = CLEAR + 0.5 * (texts.width(words) * abs(across[0]) + LETTERS * abs(across[1]))
     offs = [side * (off + far) for far in FARTHER for side in (1, -1)]
     return texts.put([start + share * way + x * across for x in offs for share in SHARES], words)
-
-
-def _around(texts: TextPlaces, place: np.ndarray, words: str) -> np.ndarray:
-    """Return the middle of a name around a point."""
-    half = 0.5 * texts.width(words)
-    return texts.put([place + [dx + np.sign(dx) * half, dy - BASE] for dx, dy in AROUND], words)
 
 
 def _text(middle: np.ndarray, words: str) -> str:
