@@ -233,7 +233,7 @@ def test_what_varies_by_rounding_alone_has_no_shares():
     assert found.shares[angle]["number.r"].total == 0.0 and found.second_order.trusted[angle]
     assert found.shares[place]["number.r"].total == pytest.approx(1.0)
     row = next(line for line in str(found).splitlines() if angle in line)
-    assert row.split()[4] == "0" and row.endswith("none varies it") and "Not quadratic" not in str(found)
+    assert row.split()[4] == "0" and row.endswith("no tolerance varies it") and "Not quadratic" not in str(found)
 
 
 def test_numbers_are_read_and_printed_in_the_units_of_the_drawing(four_bar, tmp_path, capsys):

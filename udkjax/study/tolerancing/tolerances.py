@@ -214,7 +214,7 @@ class ToleranceAnalysis:
             unit, size = self.shown(name)
             nominal, mean, least, most = (f"{x / size:.6g}" for x in (self.nominal[place], self.mean[name], *low[name]))
             spread = f"{deviation / size:.3g}"
-            rows.append((name, unit, nominal, mean, spread, least, most, outside, shares or "none varies it"))
+            rows.append((name, unit, nominal, mean, spread, least, most, outside, shares or "no tolerance varies it"))
         heads = "measure", "unit", "nominal", "mean", "standard deviation", "0.1 %", "99.9 %", "outside", "share of the variance"
         remarks = []
         if self.not_assembled:
