@@ -129,9 +129,10 @@ class StudioPage:
 
 @contextmanager
 def served(folder: Path, opened: str = ""):
-    """Serve a studio in a folder; yields its address."""
-    command = [sys.executable, "-c", COMMAND, "studio", str(folder / opened), "--no-browser"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=dict(os.environ)) as process:
+    """Serve a studio in a folder, with a file of it or the address of a drawing; yields its address."""
+    shown = opened if opened.startswith("udkjax:") else str(folder / opened)
+    command = [sys.executable, "-c", COMMAND, "studio", shown, "--no-browser"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=dict(os.environ), cwd=folder) as process:
         try:
             assert process.stdout is not None
             address = process.stdout.readline().strip()

@@ -730,3 +730,14 @@ test("it is said which dimension gives way", () => {
   assert.match(note, /^link2 is now [0-9.]+ mm$/);
   assert.equal(document.pins.C.length[1], 80);
 });
+
+test("names of kept curves are shortened to the width of the chart, and values never", () => {
+  const curves = [{name: "B: x", unit: "mm", now: 160}, {name: "A: angle between crank and coupler", unit: "°", now: 155.2}, {name: "C: speed", unit: "", now: NaN}], wide = words => 7 * words.length;
+  assert.deepEqual(chart.legendOf(curves.slice(0, 1), 50, wide), ["160 mm"]);
+  assert.deepEqual(chart.legendOf(curves, 900, wide), ["B: x 160 mm", "A: angle between crank and coupler 155.2 °", "C: speed –"]);
+  for (const room of [500, 350, 250]) {
+    const found = chart.legendOf(curves, room, wide);
+    assert.ok(found.reduce((sum, words) => sum + wide(words) + 18, 0) <= room && found[1].endsWith("155.2 °"), found.join("|"));
+  }
+  assert.ok(chart.legendOf(curves, 500, wide)[1].startsWith("A: angl") && chart.legendOf(curves, 350, wide)[1].includes("… 155.2 °"));
+});

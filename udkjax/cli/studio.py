@@ -23,19 +23,28 @@ def studio(
     default the current one, can be opened and saved.
 
     Args:
-        file: drawing to open or create; or the folder to work in.
+        file: drawing to open or create; or the folder to work in; or the address of a shared drawing, udkjax:drawing=...
         browser: open a browser.
         port: port to listen on; by default a free one.
         json: print the address as JSON.
     """
     if not 0 <= port <= MOST_PORT:
         refuse(f"--port {port}: must be between 0 and {MOST_PORT}")
-    folder = Path.cwd() if file is None else file if file.is_dir() else file.parent
-    if not folder.is_dir():
-        refuse(f"there is no folder {folder}")
-    opened = "" if file is None or file.is_dir() else file.name
-    if opened and not opened.endswith(".toml"):
-        refuse(f"{file}: must be a drawing (.toml)")
+    from udkjax.studio.addresses import is_address, text_of
+    from udkjax.studio.limits import RefusedError
+
+    folder, opened = Path.cwd(), ""
+    if file is not None and is_address(str(file)):
+        try:
+            text_of(opened := str(file))
+        except RefusedError as error:
+            refuse(str(error))
+    elif file is not None:
+        folder, opened = (file, "") if file.is_dir() else (file.parent, file.name)
+        if not folder.is_dir():
+            refuse(f"there is no folder {folder}")
+        if opened and not opened.endswith(".toml"):
+            refuse(f"{file}: must be a drawing (.toml)")
 
     from udkjax.studio.serving import serve
 

@@ -1,7 +1,8 @@
-"""The server of the studio: the files of the page, and six routes with JSON requests and answers.
+"""The server of the studio: the files of the page, and seven routes with JSON requests and answers.
 
     POST /api/list        {}                                          -> {files, templates, folder}
-    POST /api/open        {path} or {template}                        -> {text, document, path, revision, problems}
+    POST /api/open        {path}, {template} or {address}             -> {text, document, path, revision, problems}
+    POST /api/share       {text}                                      -> {address} of a drawing
     POST /api/save        {path, text, revision, export?, table?}     -> {path, revision}, or 409 with the revision on disk
     POST /api/compile     {text, document?, engine?}                  -> {text, document, problems, scene, engine}
     POST /api/diagnose    {text, about?, end?}                        -> findings about the drawing
@@ -26,6 +27,7 @@ from starlette.types import ASGIApp
 
 from udkjax.annotations import JsonObject
 from udkjax.scene.drawing.drawn_quantities import Units
+from udkjax.studio.addresses import address_of, text_of
 from udkjax.studio.folder import Folder
 from udkjax.studio.gate import INTERFACE, Gate
 from udkjax.studio.limits import COMPILE_SECONDS, DIAGNOSE_SECONDS, EXPORT_SECONDS, RefusedError, require_size
@@ -56,13 +58,20 @@ class Studio:
         return {"files": self.folder.list(), "folder": self.folder.root.name, **templates}
 
     def open(self, request: JsonObject) -> JsonObject:
-        """Return the text and the tables of a file or template."""
+        """Return the text and the tables of a file, of a template, or of a drawing shared by address."""
         if "template" in request:
             opened = self.reader.call("open_template", {"name": request["template"]}, COMPILE_SECONDS)
+            return {**opened, "path": "", "revision": None}
+        if isinstance(request.get("address"), str):
+            opened = self.reader.call("open_text", {"text": text_of(request["address"])}, COMPILE_SECONDS)
             return {**opened, "path": "", "revision": None}
         text, revision = self.folder.read(request.get("path"))
         opened = self.reader.call("open_text", {"text": text}, COMPILE_SECONDS)
         return {**opened, "path": request["path"], "revision": revision}
+
+    def share(self, request: JsonObject) -> JsonObject:
+        """Return the address of a drawing."""
+        return {"address": address_of(require_size(request.get("text")))}
 
     def save(self, request: JsonObject) -> JsonObject:
         """Write a drawing or an export of it, unless the file on disk has another revision than the page expects."""
@@ -114,7 +123,7 @@ def application(studio: Studio, port: int, token: str) -> ASGIApp:
         port: port at which it listens.
         token: token that each request to the interface must carry.
     """
-    actions = [studio.list, studio.open, studio.save, studio.compile, studio.diagnose, studio.design]
+    actions = [studio.list, studio.open, studio.share, studio.save, studio.compile, studio.diagnose, studio.design]
     routes = [Route(f"{INTERFACE}{action.__name__}", _answering(action), methods=["POST"]) for action in actions]
     return Gate(Starlette(routes=[*routes, Route("/{path:path}", _page_file)]), port, token)
 

@@ -5,6 +5,7 @@ from typing import Any
 
 MOST_BODY_BYTES = 2_000_000  # of a request; a drawing of a thousand elements has 100 kB
 MOST_TEXT_CHARACTERS = 500_000  # of a scene file
+MOST_ADDRESS_CHARACTERS = 8_000  # of a shared drawing: a command line of Windows takes 8,191; templates have 300 to 700
 MOST_ELEMENTS = 1_000  # of a drawing; an excavator has 30, and pins are compared in pairs
 MOST_LISTED = 500  # files of a folder
 MOST_FOLDERS_DEEP = 3  # levels below the served folder

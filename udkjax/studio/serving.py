@@ -9,6 +9,7 @@ from pathlib import Path
 from urllib.parse import quote
 
 from udkjax.extras import OptionalImport
+from udkjax.studio.addresses import KEY, is_address
 from udkjax.studio.folder import Folder
 
 with OptionalImport():
@@ -28,7 +29,7 @@ def serve(root: Path, opened: str = "", port: int = 0, browse: bool = True, say:
 
     Args:
         root: the folder whose files may be opened and saved.
-        opened: path of a file in the folder that the page opens, or empty.
+        opened: path of a file in the folder that the page opens, or the address of a drawing, or empty.
         port: port at which to listen; 0 for any free port.
         browse: True to open a browser.
         say: function that shows the address to the user.
@@ -41,7 +42,8 @@ def serve(root: Path, opened: str = "", port: int = 0, browse: bool = True, say:
         listener.listen()  # so that early connections wait for the server instead of being refused
         bound = listener.getsockname()[1]
         app = application(Studio(Folder(root), *workers), bound, token)
-        address = f"http://{LOOPBACK}:{bound}/#t={token}" + (f"&f={quote(opened)}" if opened else "")
+        drawing = f"&{KEY}{quote(opened.partition(KEY)[2])}" if is_address(opened) else f"&f={quote(opened)}" if opened else ""
+        address = f"http://{LOOPBACK}:{bound}/#t={token}{drawing}"
         config = uvicorn.Config(app, log_level="warning", access_log=False, server_header=False, lifespan="off", ws="none")
         try:
             for worker in workers:

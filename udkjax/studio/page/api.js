@@ -6,6 +6,9 @@ const token = fragment.get("t") ?? "";
 /** The file named in the address. */
 export const askedFile = fragment.get("f") ?? "";
 
+/** The address of the drawing in that of the page. */
+export const askedAddress = fragment.has("drawing") ? `drawing=${fragment.get("drawing")}` : "";
+
 /** A request that failed or was refused; `status` and `details` come from the answer. */
 export class RequestError extends Error {
   constructor(status, details) {
@@ -14,7 +17,7 @@ export class RequestError extends Error {
   }
 }
 
-/** Send a request to one of the routes list, open, save, compile, diagnose, design. */
+/** Send a request to one of the routes list, open, share, save, compile, diagnose, design. */
 export async function ask(route, request = {}, signal = undefined) {
   let answer;
   try {

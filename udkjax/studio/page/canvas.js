@@ -65,6 +65,8 @@ export class DrawingCanvas {
     studio.vectors.draw(painter, theme);
     this.places = this.placesOf(document);
     this.names.begin(painter, this.places.values());
+    const {offsetLeft: left, offsetTop: top, offsetWidth: wide, offsetHeight: high} = studio.parts.options;
+    this.names.boxes.push([left, top, left + wide, top + high]);
     studio.dimensions.draw(painter, theme, this.names);
     this.marks(studio, painter, theme);
     this.labels(studio, painter, theme);

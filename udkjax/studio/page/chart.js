@@ -5,7 +5,8 @@ import {Painter, readable} from "./player/painter.js";
 
 const LEFT = 58, RIGHT = 12, BOTTOM = 22;  // px around the curves
 const AXIS = 50, MOST_AXES = 3, LEAST_WIDE = 180;  // px of each further axis; the most of them, and the least width that they leave to the curves
-const TOPS = [40, 60], NAMES = [17, 48];  // px: the top of one curve and of several, and the middle of the line of their values
+const OVER = {tops: [40, 60], names: [17, 48]}, BELOW = {tops: [26, 26], names: [12, 12]};  // px: the top of one curve and of several, and the middle of the line of their values; where a bar lies over the chart, or above it
+const APART = 18;  // px between values
 const TICKS = [7, 5];  // largest numbers of steps along and up
 const ANGLES = [1, 2, 5, 10, 15, 30, 45, 90, 180, 360];  // degrees: steps along the angle of a motor
 const EPS = 1e-12;
@@ -49,10 +50,24 @@ export function extremesOf(values, count) {
   return low < 0 || values[high] - values[low] <= FLAT * Math.max(Math.abs(values[low]), Math.abs(values[high])) ? [] : [low, high];
 }
 
-/** Draw curves {name, unit, values, now} over `along` {values, range, unit, now, count}: an axis for each unit. */
-export function drawChart(context, width, height, curves, along, theme, log = false) {
+/** The values of curves {name, unit, now} in words, with their names if there are several, which are shortened to a room (px). */
+export function legendOf(curves, room, wide) {
+  const values = curves.map(({unit, now}) => `${Number.isFinite(now) ? short(now) : "–"}${unit && ` ${unit}`}`);
+  if (curves.length === 1) return values;
+  const all = curves.map(({name}, k) => `${name} ${values[k]}`), share = room / curves.length - APART;
+  if (all.reduce((sum, words) => sum + wide(words) + APART, 0) <= room) return all;
+  return curves.map(({name}, k) => {
+    let size = name.length;
+    const words = () => (size === name.length ? all[k] : size ? `${name.slice(0, size)}… ${values[k]}` : values[k]);
+    while (size && wide(words()) > share) size--;
+    return words();
+  });
+}
+
+/** Draw curves {name, unit, values, now} over `along` {values, range, unit, now, count}: an axis for each unit; `isCovered` by a bar at its top. */
+export function drawChart(context, width, height, curves, along, theme, log = false, isCovered = true) {
   const painter = new Painter(context, {x: 0, y: 0, scale: 1}, theme, 1, null), scaled = y => (log ? Math.log10(Math.max(Math.abs(y), 1e-300)) : y);
-  const units = unitsOf(curves), room = roomOf(curves, width), right = width - room, bottom = height - BOTTOM, several = curves.length > 1 ? 1 : 0, top = TOPS[several];
+  const units = unitsOf(curves), room = roomOf(curves, width), right = width - room, bottom = height - BOTTOM, several = curves.length > 1 ? 1 : 0, {tops, names} = isCovered ? OVER : BELOW, top = tops[several];
   const ranges = new Map(units.map(unit => [unit, rangeOf(curves.filter(c => c.unit === unit).map(({values}) => Array.from(values.slice(0, along.count), scaled)))]));
   if (!ranges.get(units[0])) return painter.text("no values for this motion", [width / 2, height / 2], theme.soft, {align: "center", halo: false});
   const x = value => LEFT + Math.max(right - LEFT, 1) * (value - along.range[0]) / (along.range[1] - along.range[0] || 1);
@@ -106,13 +121,13 @@ export function drawChart(context, width, height, curves, along, theme, log = fa
     });
   }
   painter.line([[x(along.now), top - 4], [x(along.now), bottom]], 1.2, theme.ink);
+  context.font = "600 12px system-ui";
+  const wide = words => context.measureText(words).width, legend = legendOf(curves, width - 2 * RIGHT, wide);
   let edge = width - RIGHT;
-  [...curves.entries()].reverse().forEach(([k, {name, unit, now}]) => {
-    const words = `${curves.length > 1 ? `${name} ` : ""}${Number.isFinite(now) ? short(now) : "–"}${unit && ` ${unit}`}`;
-    context.font = "600 12px system-ui";
-    painter.text(words, [edge, NAMES[several]], readable(colourOf(k), theme), {align: "right", weight: 600, halo: false});
+  [...curves.entries()].reverse().forEach(([k, {unit, now}]) => {
+    painter.text(legend[k], [edge, names[several]], readable(colourOf(k), theme), {align: "right", weight: 600, halo: false});
     if (Number.isFinite(now) && ranges.get(unit)) painter.circle([x(along.now), y(now, ranges.get(unit))], 3.4, {fill: colourOf(k), stroke: theme.panel});
-    edge -= context.measureText(words).width + 18;
+    edge -= wide(legend[k]) + APART;
   });
   return undefined;
 }

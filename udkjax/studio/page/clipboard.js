@@ -7,6 +7,7 @@ import {namesIn} from "./expressions.js";
 import {usesNumbers} from "./units.js";
 
 const MARK = "udkjax drawing";  // the key of a fragment in the text of the clipboard
+const ADDRESS = "drawing=";  // in the address of a shared drawing
 const COPY_PIXELS = 24;  // between the original and its copy
 const COORDINATE_KEYS = ["centre", "outline", "holes"];  // of a link, in the axes of the drawing
 
@@ -109,9 +110,11 @@ export function followClipboard(studio, isTyping, remove) {
   window.addEventListener("cut", event => { if (take(event)) remove(studio); });
   window.addEventListener("paste", event => {
     if (!isOurs(event)) return;
-    const fragment = readFragment(event.clipboardData.getData("text/plain"));
+    const text = event.clipboardData.getData("text/plain"), fragment = readFragment(text);
     event.preventDefault();
-    if (fragment) paste(studio, fragment); else studio.say("the clipboard has no part of a drawing: copy one with Ctrl C");
+    if (fragment) paste(studio, fragment);
+    else if (text.includes(ADDRESS)) studio.files.unlessChanged(() => studio.files.openAddress(text));
+    else studio.say("the clipboard has neither a part nor the address of a drawing: copy one with Ctrl C, or under Share");
   });
 }
 

@@ -31,7 +31,7 @@ export class CurvesPanel {
   constructor(studio, element) {
     Object.assign(this, {studio, panel: "kinematics", chosen: {}, served: {}, facts: {}, busy: ""});
     this.tabs = Object.entries(PANELS).map(([name, {title, words}]) => [name, make("button", {type: "button", role: "tab", title: words, onclick: () => this.open(name)}, title)]);
-    this.actions = Object.entries(PANELS).flatMap(([panel, {actions}]) => actions.map(([name, words, title]) => ({panel, name, button: button(words, title, () => this.ask(name))})));
+    this.actions = Object.entries(PANELS).flatMap(([panel, {actions}]) => actions.map(([name, words, title]) => ({panel, name, button: button(words, title, () => this.ask(name), "action")})));
     this.select = make("select", {"aria-label": "curve", onchange: () => { this.chosen[this.panel] = this.select.value; this.isKept = true; studio.redraw(); }});
     this.over = make("select", {"aria-label": "over", title: "the horizontal axis", onchange: () => studio.redraw()});
     this.more = button("+", "keep this curve, and choose another one as well", () => this.keep());
@@ -277,7 +277,7 @@ export class CurvesPanel {
       this.cache = {key, curves: names.map(name => ({name, ...this.values(name)}))};
     }
     const {along} = this, {curves} = this.cache, now = values => along.between(values, motion.t);
-    return drawChart(context, width, height, curves.map(curve => ({...curve, now: now(curve.values)})), {...along, now: along.at(motion.t)}, theme, curves[0].log);
+    return drawChart(context, width, height, curves.map(curve => ({...curve, now: now(curve.values)})), {...along, now: along.at(motion.t)}, theme, curves[0].log, canvas.offsetTop === 0);
   }
 
   drawNothing(context, theme, width, height) {

@@ -3,6 +3,7 @@
 import {ask} from "./api.js";
 import {shapeProblem} from "./checks.js";
 import {EMPTY} from "./document.js";
+import {addressField} from "./sharing.js";
 import {make} from "./player/elements.js";
 
 const EXPORTS = {html: "live page, simulates offline", svg: "vector picture", png: "bitmap picture", gif: "animated picture", mp4: "film", dxf: "drawing for CAD",
@@ -73,7 +74,7 @@ export class FileActions {
           make("div", {class: "columns"},
             make("section", {}, make("h3", {}, `Files in ${folder}`), files.length ? make("ul", {}, ...files.map(name => entry(name, () => this.openFile(name)))) : make("p", {}, "no scene files yet")),
             make("section", {}, make("h3", {}, "Templates"), make("ul", {}, ...templates.map(({name, title}) => entry(title, () => this.openTemplate(name)))))),
-          this.buttons(["Cancel"]));
+          addressField(this.studio), this.buttons(["Cancel"]));
       } catch (error) { this.fail(error); }
     });
   }
@@ -89,14 +90,17 @@ export class FileActions {
 
   openTemplate(template) { return this.open({template}, error => this.fail(error)); }
 
+  openAddress(address) { return this.open({address}, error => this.fail(error)); }
+
   async open(request, failed) {
-    this.studio.say(`opening ${request.path ?? request.template} …`);
+    const asked = request.path ?? request.template ?? "the shared drawing";
+    this.studio.say(`opening ${asked} …`);
     try {
       const {text, document, path, revision, problems: said, drawn} = await ask("open", request);
       const problems = document ? [shapeProblem(document)].filter(Boolean) : said;
       if (!document || problems.length) {
         this.studio.say(problems.join("; "), true);
-        this.dialog(`Cannot draw ${path || request.template}`, make("ul", {class: "problems"}, ...problems.map(problem => make("li", {}, problem))), this.buttons(["Close"]));
+        this.dialog(`Cannot draw ${asked}`, make("ul", {class: "problems"}, ...problems.map(problem => make("li", {}, problem))), this.buttons(["Close"]));
         return;
       }
       Object.assign(this, {path: drawn ? "" : path, revision: drawn ? null : revision, saved: path && !drawn ? {document, text} : {document, text}});

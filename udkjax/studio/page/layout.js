@@ -1,5 +1,6 @@
 // The page: its bars, the drawing, and the panels around it.
 
+import {share} from "./sharing.js";
 import {KEYS, TOOLS} from "./tools.js";
 import {VECTORS} from "./vectors.js";
 import {button, icon, keepKeys, make, svgIcon} from "./player/elements.js";
@@ -33,7 +34,8 @@ export function buildPage(studio, root) {
   parts.redo = button(svgIcon(ICONS.redo), "redo (Ctrl+Y)", () => studio.redo(), "icon");
   const files = make("nav", {class: "group", "aria-label": "file"},
     button("New", "new drawing (Ctrl+N)", () => studio.files.startNew()), button("Open", "open a file or a template (Ctrl+O)", () => studio.files.showOpen()),
-    button("Save", "save (Ctrl+S)", () => studio.files.save(false)), button("Export", "export as page, picture, film, table or script", () => studio.files.showExport()));
+    button("Save", "save (Ctrl+S)", () => studio.files.save(false)), button("Export", "export as page, picture, film, table or script", () => studio.files.showExport()),
+    button("Share", "share the drawing by address", () => share(studio)));
   const header = make("header", {}, parts.title, files, make("div", {class: "group"}, parts.undo, parts.redo,
     button(svgIcon(ICONS.fit), "fit (F)", () => studio.fit(), "icon")), make("div", {class: "group end"},
     button(icon("theme"), "switch between dark and light", () => studio.switchTheme(), "icon"), button("?", "keyboard shortcuts (?)", () => studio.showHelp(), "icon")));
@@ -59,7 +61,7 @@ export function buildPage(studio, root) {
   parts.dimension = make("div", {class: "dimension"});
   parts.wanted = make("div", {class: "wanted", role: "group", "aria-label": "wanted path"});
   const load = button("path", "read a wanted path from a table (CSV) of x and y", () => studio.wanted.input.click());
-  const options = make("details", {class: "toggles"}, make("summary", {}, "view"), make("div", {class: "group"}, ...toggles, load, parts.picture));
+  const options = parts.options = make("details", {class: "toggles"}, make("summary", {}, "view"), make("div", {class: "group"}, ...toggles, load, parts.picture));
   const narrow = matchMedia("(max-width: 1000px)"), unfold = () => { options.open = !narrow.matches; };
   narrow.addEventListener("change", unfold);
   unfold();

@@ -1,6 +1,6 @@
 // The studio: one state, its changes, and the parts of the page that show it.
 
-import {askedFile} from "./api.js";
+import {askedAddress, askedFile} from "./api.js";
 import {DrawingCanvas} from "./canvas.js";
 import {CurvesPanel} from "./curves.js";
 import {DimensionMarks} from "./dimension_marks.js";
@@ -257,3 +257,4 @@ class Studio {
 const studio = new Studio(document.getElementById("studio"));
 window.studio = studio;
 if (askedFile) studio.files.openFile(askedFile, true); else studio.files.showStart();
+if (askedAddress) studio.files.openAddress(askedAddress);
