@@ -1,21 +1,22 @@
 """Machine code that follows the positions of a driven mechanism from value to value: a batch of members in W lanes.
 
-A step predicts by the third-order Taylor polynomial of q(s), from q', q'' and the change of q'', and corrects twice by Newton's
-method with elimination. A position is sound if it is closed up to rounding errors, is near its prediction, has a small rotation
+A step predicts by the third-order Taylor polynomial of q(s), from q', q'' and the change of q'', and corrects once or twice by
+Newton's method with elimination. A position is sound if it is closed up to rounding errors, is near its prediction, has a small rotation
 of the tangent, and is so far from dependent rows that enough digits of q'' are correct. Values that are far apart are reached in
 several steps: each lane halves a step that does not lead to a sound position, and lengthens the steps after one that does. A lane
 stops where even the shortest step fails, at its last sound position; from there the caller continues by singular values.
 
 If the mechanism has as many independent rows as coordinates, each position has a side, the sign of det Psi_q of these rows. The
 side changes where branches meet, and differs on another branch nearby. If it changes more than once on the way to a value, the
-side of that value is zero.
+side of that value is zero. A step that is short beside the distance from dependent rows keeps its side: the determinant, which
+takes as long as all other parts of a step, is then not computed.
 """
 
 import numpy as np
 
 from udkjax.equations.programs.run_programs import RunPrograms
 from udkjax.equations.rows.position_closure import CLOSURE
-from udkjax.native.language.ir import DOUBLE, POINTER, Function, Value
+from udkjax.native.language.ir import DOUBLE, INT, POINTER, Function, Value
 from udkjax.native.language.program import PointerPlace
 from udkjax.native.module.layout import Lane, Plan
 from udkjax.native.module.module import Module
@@ -26,6 +27,11 @@ from udkjax.native.pseudoinverses.weighted_rows import WeightedRows
 from udkjax.native.run.members import write_begin
 
 CORRECTIONS = 2
+# A correction up to this length, in characteristic lengths or radians, is the last: the next is of the order of its square.
+LAST_CORRECTION = 1e-9
+# Arc of a step, over the square of the distance from dependent rows, up to which all rows stay independent. Over an arc, a row
+# turns by about as much, and the span of the others by up to the arc over their distance.
+KEEPS_SIDE = 0.25
 STRAIGHT = 0.95  # cosine of the largest rotation of the tangent in a step
 SLACK = 0.1  # largest distance of a position from its prediction, as a fraction of the step
 _METHOD = LUCode(relative=True)
@@ -136,9 +142,12 @@ class Marching(Module):
             self.put_entry(f, "third derivative", i, f.select(accepted, third, self.entry(f, "third derivative", i)))
             for name, before in (("state q", "previous q"), ("result dq", "previous dq"), ("result dv", "previous ddq")):
                 self.put_entry(f, name, i, f.select(accepted, self.entry(f, name, i), self.entry(f, before, i)))
-        side = self._side(f)
-        going.turns.where(accepted & side.is_not(going.side.value), going.turns.value + 1.0)
-        going.side.where(accepted, side)
+        keeps = f.abs(h) * new_rate < s.distance * s.distance * KEEPS_SIDE
+        may_turn = accepted & (begins | ~keeps)
+        with f.if_(f.any_of(may_turn)):
+            side = self._side(f)
+            going.turns.where(may_turn & side.is_not(going.side.value), going.turns.value + 1.0)
+            going.side.where(may_turn, side)
         going.value.where(accepted, now)
         going.count.where(tries, going.count.value + 1.0)
         ends = refused & ~(f.abs(h) * old_rate > SHORTEST) | (going.count.value > self.field(f, "times") * 4 + MAX_STEPS)
@@ -158,10 +167,17 @@ class Marching(Module):
                 self.put_entry(f, name, i, x)
             for name in ("state q", "prediction"):
                 self.put_entry(f, name, i, predicted)
-        for _ in range(CORRECTIONS):
+        length, steps = f.variable(np.inf), f.variable(0, INT, 1)
+        is_long = lambda: ~(length.value < LAST_CORRECTION)  # noqa: E731
+        with f.while_(lambda: (steps.value < CORRECTIONS) & f.any_of(is_long())):
             self.invoke(f, "newton_q")
+            corrects, longest = is_long(), f.variable(0.0)
             with f.each(self.n) as i:
-                self.put_entry(f, "state q", i, self.entry(f, "corrected q", i))
+                before, after = self.entry(f, "state q", i), self.entry(f, "corrected q", i)
+                longest.value = f.max(f.abs(after - before) * self.entry(f, "inverse unit", i), longest.value)
+                self.put_entry(f, "state q", i, f.select(corrects, after, before))
+            length.where(corrects, longest.value)
+            steps.value = steps.value + 1
         self.invoke(f, "value_derivatives")
 
     def _side(self, f: Function) -> Value:
