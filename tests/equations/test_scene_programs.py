@@ -19,8 +19,7 @@ from udkjax.equations.programs.unrolled import Unrolled
 from udkjax.equations.rows.dense_rows import DenseTerms
 from udkjax.equations.terms.structure import numbers_as_vector
 from udkjax.expressions.loops import float_loops
-from udkjax.expressions.loops.array_loops import ArrayLoops
-from udkjax.expressions.loops.float_loops import _WORTH_WRITING, FloatLoops
+from udkjax.expressions.loops.array_loops import WORTH_COMPILING_AT_MANY, ArrayLoops
 from udkjax.pinv.rank_policy import RankPolicy
 from udkjax.programs.deferred import deferred
 
@@ -289,7 +288,7 @@ def test_floats_and_arrays_find_the_same(monkeypatch):
 
 
 def test_many_states_at_once_are_single_states():
-    """By loops at first, later by a written function, whose variables have a number for each state."""
+    """By NumPy at first, later by machine code in lanes."""
     names = ("revolute", "prismatic", "slot", "weld")
     mechanism = udk.Mechanism(BODIES, {name: JOINTS[name] for name in names}, forces={"push": FORCES["push"]})
     _scene_programs.cache_clear()
@@ -303,8 +302,8 @@ def test_many_states_at_once_are_single_states():
             return np.concatenate([at.psi(t, q), *at.geometry(t, q, v), *at.loads(t, q, v), at.energy(t, q, v)])
 
     single = np.stack([evaluate(t[k], q[:, k], v[:, k]) for k in range(5)], 1)
-    with calls_of(FloatLoops.of_many) as runs:
-        for _ in range(_WORTH_WRITING + 1):
+    with calls_of(ArrayLoops.at_many) as runs:
+        for _ in range(WORTH_COMPILING_AT_MANY + 1):
             assert_allclose(evaluate(t, q, v), single, rtol=1e-12, atol=1e-12)
     at_rest = at.geometry(t, q, np.zeros((q0.size, 1)))  # the same velocity for all states
     assert_allclose(at_rest[2], at.geometry(t, q, np.zeros_like(q))[2], rtol=0, atol=0)

@@ -46,7 +46,8 @@ def driver_efforts(
         motion: q, v and a.
 
     Returns:
-        Efforts (N m, N), rates (rad/s, m/s), and the part of M a - F that nothing exerts, relative to M a and the loads.
+        Efforts (N m, N) and rates (rad/s, m/s), each (k, T), and the part of M a - F that nothing exerts, relative to M a and the
+        loads.
     """
     found = None
     if joints.is_concrete and not is_traced(values):
@@ -98,7 +99,7 @@ def _by_jax(
         residual = jnp.max(jnp.abs(required - free((C * units).T @ f))) / jnp.where(size > 0, size, 1.0)
         return jnp.where(determined, f, jnp.nan), C @ v, residual
 
-    return jax.vmap(at)(ts, q, v, a)
+    return jax.vmap(at, out_axes=(1, 1, 0))(ts, q, v, a)
 
 
 def _free_part(J: Float[Array, "m n"]) -> Callable[[Array], Array]:

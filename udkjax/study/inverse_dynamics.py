@@ -203,8 +203,8 @@ def inverse_dynamics(
     if len(q) != len(times):
         raise ValueError(f"motion has {len(q)} states, but ts has {len(times)} times: give the times of the motion")
     efforts, rates, residual = driver_efforts(joints, analyse(joints), values, w, times, (q, motion.v, motion.a))
-    columns = {name: efforts[:, k] for k, name in enumerate(named)}
-    powers = {name: x * rates[:, k] for k, (name, x) in enumerate(columns.items())}
+    columns = dict(zip(named, efforts, strict=True))
+    powers = {name: x * rate for (name, x), rate in zip(columns.items(), rates, strict=True)}
     parts: dict[str, Any] = {"ts": times, "motion": computed, "efforts": columns, "powers": powers, "residual": residual}
     with jax.ensure_compile_time_eval() if is_within_jit() else nullcontext():  # concrete numbers stay concrete
         parts = _put_concrete(parts) if is_traced(parts) else put_arrays(parts)

@@ -17,7 +17,7 @@ from udkjax.equations.terms.scale_program import RANK_TOL
 from udkjax.programs.identity_cache import cached_by_identity
 from udkjax.scene.mechanism import Mechanism
 
-# Efforts (T, k), rates of their coordinates (T, k), unbalanced parts of the loads (T,).
+# Efforts (k, T), rates of their coordinates (k, T), unbalanced parts of the loads (T,).
 EffortArrays: TypeAlias = tuple[NumericArray, NumericArray, NumericArray]
 Slopes: TypeAlias = Callable[[np.ndarray], np.ndarray]
 ALONG = 64 * float(np.finfo(float).eps)  # largest |J u| of a motion u that satisfies J u = 0 up to rounding, relative to J
@@ -32,22 +32,23 @@ def efforts_by_numpy(
 
     Args:
         mechanism: the mechanism without its drivers.
-        slopes: the derivatives C (T, k, n) of the coordinates by q, as a function of q (T, n).
+        slopes: the derivatives C (k, n, T) of the coordinates by q, as a function of q (n, T).
         analysis: the analysis of the mechanism.
         weights: weight of each squared effort.
         ts: times (T,).
         motion: q, v and a, each (T, bodies, 3).
 
     Returns:
-        Efforts (T, k), rates (T, k) and unbalanced parts (T,).
+        Efforts (k, T), rates (k, T) and unbalanced parts (T,).
     """
     if not by_numpy(mechanism, (analysis.scales, weights, ts, motion)):
         return None
     equations, w, times = state_arrays(mechanism), np.asarray(weights, float), np.asarray(ts, float)
-    states = [np.asarray(x, float).reshape(len(times), -1) for x in motion]
+    # NumPy sums along the first axis in a fraction of the time that it takes along a short last one.
+    states = [np.ascontiguousarray(np.asarray(x, float).reshape(len(times), -1).T) for x in motion]
     pieces = equations.pieces(len(times))
-    columns = [_efforts_at(equations, slopes, analysis, w, *[x[p] for x in (times, *states)]) for p in pieces]
-    efforts, rates, unbalanced = columns[0] if len(columns) == 1 else map(np.concatenate, zip(*columns, strict=True))
+    columns = [_efforts_at(equations, slopes, analysis, w, *[x[..., p] for x in (times, *states)]) for p in pieces]
+    efforts, rates, unbalanced = columns[0] if len(columns) == 1 else (np.concatenate(x, -1) for x in zip(*columns, strict=True))
     return efforts, rates, unbalanced
 
 
@@ -58,7 +59,7 @@ class _Units(NamedTuple):
     """Weights of rows and units, by NumPy."""
 
     weights: np.ndarray  # (m,)
-    coordinates: np.ndarray  # (n,)
+    coordinates: np.ndarray  # (n, 1)
     inertial_load: float  # of the characteristic motion (N m)
     independent: np.ndarray | None  # indices of the rows of joints that are not redundant; None if unknown
     redundant: np.ndarray
@@ -71,63 +72,63 @@ def _units_of(analysis: Analysis) -> _Units:
     independent = None if analysis.redundant_rows is None else np.array(analysis.independent_rows, int)
     redundant = np.array(analysis.redundant_rows or (), int)
     weights = scales.length / np.asarray(analysis.row_units)
-    return _Units(weights, np.asarray(analysis.coordinate_units), load, independent, redundant)
+    return _Units(weights, np.asarray(analysis.coordinate_units)[:, None], load, independent, redundant)
 
 
 def _efforts_at(
     equations: StateArrays, slopes: Slopes, analysis: Analysis, w: np.ndarray, t: np.ndarray, *motion: np.ndarray
 ) -> EffortArrays:
     q, v, a = motion
-    scale = _units_of(analysis)
-    units, share, (rows, columns) = scale.coordinates, 1 / np.sqrt(w), equations.entries
-    entries = equations.jacobian_entries(t, q) * (scale.weights[rows] * units[columns])[:, None]
-    C, (force, sizes) = slopes(q), equations.force_and_sizes(t, q, v)
-    missing, pull = units * (equations.mass * a - force), C * (share[:, None] * units)
-    reached = np.isfinite(entries).all(0) & np.isfinite(missing).all(1) & np.isfinite(pull).reshape(len(t), -1).all(1)
+    scale, share, mass = _units_of(analysis), 1 / np.sqrt(w), equations.mass[:, None]
+    units, (rows, columns) = scale.coordinates, equations.entries
+    entries = equations.jacobian_entries(t, q.T) * (scale.weights[rows] * units[columns, 0])[:, None]
+    C, (force, sizes) = slopes(q), (x.T for x in equations.force_and_sizes(t, q.T, v.T))
+    missing, pull = units * (mass * a - force), C * (share[:, None, None] * units)
+    largest = np.abs(entries).max(0, initial=0.0)
+    reached = np.isfinite(largest) & np.isfinite(missing).all(0) & np.isfinite(pull).all((0, 1))
     # Relative to the single terms, since their sum may be a rounding error.
-    size = np.maximum((units * (equations.mass * np.abs(a) + sizes)).max(1), scale.inertial_load)
-    rates = (C * v[:, None]).sum(2)
+    size = np.maximum((units * (mass * np.abs(a) + sizes)).max(0), scale.inertial_load)
+    rates = (C * v).sum(1)
     if not reached.all():
-        pull, missing = (np.where(reached.reshape(-1, *[1] * (x.ndim - 1)), x, 0.0) for x in (pull, missing))
-        rates, size, entries = np.where(reached[:, None], rates, np.nan), np.where(reached, size, np.nan), entries * 1.0
-        entries[:, ~reached] = 0.0
-    f, unbalanced, found = _efforts_along(analysis, rows, columns, entries, pull, missing, v / units)
+        pull, missing, entries, largest = (np.where(reached, x, 0.0) for x in (pull, missing, entries, largest))
+        rates, size = (np.where(reached, x, np.nan) for x in (rates, size))
+    f, unbalanced, found = _efforts_along(analysis, equations, entries, largest, pull, missing, v / units)
     if not found.all():
         k = ~found
-        J = equations.dense(entries[:, k])
-        f[k], unbalanced[k] = _efforts_of_rows(scale, analysis, J, pull[k], missing[k], v[k] / units)
-        f[~reached] = np.nan
-    return share * f, rates, unbalanced / np.where(size == 0, 1.0, size)
+        given = (np.moveaxis(x[..., k], -1, 0) for x in (pull, missing, v / units))
+        fk, unbalanced[k] = _efforts_of_rows(scale, analysis, equations.dense(entries[:, k]), *given)
+        f[:, k] = fk.T
+        f[:, ~reached] = np.nan
+    return share[:, None] * f, rates, unbalanced / np.where(size == 0, 1.0, size)
 
 
 def _efforts_along(
     analysis: Analysis,
-    rows: np.ndarray,
-    columns: np.ndarray,
+    equations: StateArrays,
     entries: np.ndarray,
+    largest: np.ndarray,
     pull: np.ndarray,
     missing: np.ndarray,
     u: np.ndarray,
 ) -> _Found:
-    """Return efforts (T, k), unbalanced loads (T,), and a mask of the times for which the motion determines them.
+    """Return efforts (k, T), unbalanced loads (T,), and a mask of the times for which the motion determines them.
 
     With one degree of freedom the direction u of the motion spans the null space of J, if it satisfies J u = 0: the drivers have
-    the power that the loads lack. They must be able to move the mechanism. `entries` (entries, T) are those of J.
+    the power that the loads lack. They must be able to move the mechanism. `entries` (entries, T) are those of J, and `largest`
+    (T,) the largest of them.
     """
-    T, k = pull.shape[:2]
-    speed = np.sqrt((u * u).sum(1))
+    k, _, T = pull.shape
+    speed = np.sqrt((u * u).sum(0))
     if analysis.degrees_of_freedom != 1 or not speed.any():
-        return np.zeros((T, k)), np.zeros(T), np.zeros(T, bool)
-    u = u / np.where(speed > 0, speed, 1.0)[:, None]
-    rates, power = (pull * u[:, None]).sum(2), (missing * u).sum(1)
-    square = (rates * rates).sum(1)
-    found = (speed > 0) & (square > RANK_TOL**2 * (pull * pull).reshape(T, -1).sum(1))
+        return np.zeros((k, T)), np.zeros(T), np.zeros(T, bool)
+    u = u / np.where(speed > 0, speed, 1.0)
+    rates, power = (pull * u).sum(1), (missing * u).sum(0)
+    square = (rates * rates).sum(0)
+    found = (speed > 0) & (square > RANK_TOL**2 * (pull * pull).sum((0, 1)))
     if len(entries):
-        products = np.ascontiguousarray(u.T)[columns] * entries
-        off = [np.abs(products[rows == row].sum(0)) for row in np.unique(rows)]
-        found &= np.max(off, axis=0) <= ALONG * np.abs(entries).max(0)
-    f = rates * (power / np.where(square > 0, square, 1.0))[:, None]
-    return f, np.abs(u).max(1) * np.abs(power - (rates * f).sum(1)), found
+        found &= equations.largest_row(u[equations.entries[1]] * entries) <= ALONG * largest
+    f = rates * (power / np.where(square > 0, square, 1.0))
+    return f, np.abs(u).max(0) * np.abs(power - (rates * f).sum(0)), found
 
 
 def _efforts_of_rows(

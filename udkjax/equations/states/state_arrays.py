@@ -80,6 +80,8 @@ class StateArrays:
         programs = self._at.programs
         self.count, self.size = programs.row_count, programs.coordinate_count
         self.entries = tuple(programs.psi_q_entries[:2])  # their rows and columns
+        self._in_rows = np.argsort(self.entries[0], kind="stable")
+        self._row_starts = np.flatnonzero(np.diff(self.entries[0][self._in_rows], prepend=-1))
         self.mass = np.asarray(mass_of(mechanism, np))
         self.root = 1 / np.sqrt(self.mass)
         self._weight = self.mass * np.tile([*np.asarray(mechanism.gravity, float), 0.0], self.size // 3)
@@ -110,10 +112,11 @@ class StateArrays:
 
     def force_and_sizes(self, t: np.ndarray, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return F (T, n), and the sums of the absolute loads of gravity and of each force element (T, n)."""
-        force, sizes = (np.tile(x, (len(t), 1)) for x in (self._weight, np.abs(self._weight)))
+        force, sizes = (np.broadcast_to(x, (len(t), self.size)) for x in (self._weight, np.abs(self._weight)))
         rows = self._at.programs.at_rest.places[LOADS].rows
         if len(rows):
             loads = self._along(lambda t, q, v: self._at.element_loads(t, q, v)[LOADS], t, q, v)
+            force, sizes = force.copy(), sizes.copy()
             np.add.at(force.T, rows, loads.T)
             np.add.at(sizes.T, rows, np.abs(loads).T)
         return force, sizes
@@ -129,6 +132,10 @@ class StateArrays:
     def jacobian_entries(self, t: np.ndarray, q: np.ndarray) -> np.ndarray:
         """Return the entries (entries, T) of Psi_q, at the rows and columns `entries`."""
         return self._evaluate(lambda t, q, v: self._at.jacobian(t, q), t, q, q)
+
+    def largest_row(self, entries: np.ndarray) -> np.ndarray:
+        """Return the largest absolute sum (T,) of the entries (entries, T) of a row."""
+        return np.abs(np.add.reduceat(entries[self._in_rows], self._row_starts, 0)).max(0)
 
     def dense(self, entries: np.ndarray) -> np.ndarray:
         """Return matrices (T, m, n) from their entries (entries, T)."""

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from udkjax.expressions.loops.compiled_loops import CompiledLoops, compiled_loops
+from udkjax.expressions.loops.compiled_loops import CompiledLoops, LoopsAtMany, compiled_at_many, compiled_loops
 from udkjax.expressions.loops.float_loops import FloatLoops, LaidOutPart, Lists
 from udkjax.expressions.loops.loop_program import ADD, ALL, MAXIMUM, SET, Address, KernelLoop, LoopProgram, Reset
 from udkjax.expressions.scalars.scalar_program import ScalarProgram
@@ -19,6 +19,7 @@ _BY_ARRAYS = {ADD: np.add, MAXIMUM: np.maximum, ALL: np.minimum}
 _NEUTRAL = {ADD: 0.0, MAXIMUM: -math.inf, ALL: math.inf}
 _NOT_USED = np.zeros(1)  # value of an input that a program does not use
 WORTH_COMPILING = 100  # runs row by row on Python's floats that take as long as compiling a program quickly
+WORTH_COMPILING_AT_MANY = 40  # runs by NumPy at many states that take as long as compiling a program with optimization
 MAX_UPDATES = 8  # number of updates of one place that JAX unrolls; more become a loop
 
 
@@ -36,11 +37,12 @@ class ArrayLoops:
 
     def __init__(self, program: LoopProgram, xp: ModuleType, results: Collection[str] | None = None):
         self._parts, self._xp, self._program, self._results = list(map(_lay_out, program.parts)), xp, program, results
-        self._calls = 0
+        self._calls, self._runs_at_many = 0, 0
         self.compiled: CompiledLoops | None = None  # the same at single states, by machine code
+        self._at_many: LoopsAtMany | None = None  # and at many
         self._written = {name for part in self._parts for name, *_ in part.outputs}
         self._read = {name for part in self._parts for name, _ in part.inputs if name}
-        self._on_floats = FloatLoops(self._parts, results) if xp is np and FloatLoops.support(self._parts) else None
+        self._on_floats = FloatLoops(self._parts) if xp is np and FloatLoops.support(self._parts) else None
 
     def on_lists(self, lists: Lists) -> bool:
         """Change the lists of the numbers of arrays by a run at one state; return False if that is not possible.
@@ -70,6 +72,18 @@ class ArrayLoops:
         """Make `compiled`, if there is a compiler that supports the program; `sizes` has the lengths of all its arrays."""
         self.compiled = compiled_loops(self._program, sizes, tuple(self._results or ()))
 
+    def at_many(self, sizes: Mapping[str, int], given: Mapping[str, int]) -> LoopsAtMany | None:
+        """Return the program at many states by machine code; None until it has run so often that it is worth compiling.
+
+        Args:
+            sizes: the lengths of all its arrays except `constants` and those that describe a state.
+            given: the lengths of the arrays that describe a state.
+        """
+        self._runs_at_many += 1
+        if self._runs_at_many == WORTH_COMPILING_AT_MANY:
+            self._at_many = compiled_at_many(self._program, sizes, given, tuple(self._results or ()))
+        return self._at_many
+
     def __call__(self, arrays: Mapping[str, Any]) -> dict[str, Any]:
         """Return the arrays after a run of the program; the given arrays do not change."""
         if self._xp is jnp:
@@ -77,11 +91,9 @@ class ArrayLoops:
             for part in self._parts:
                 _run_by_jax(part, results)
             return results
-        if self._on_floats:
-            run = self._run_at_many if any(np.ndim(x) > 1 for x in arrays.values()) else self._run_on_floats
+        if self._on_floats and all(np.ndim(x) == 1 for x in arrays.values()):
             try:
-                if (found := run(arrays, self._on_floats)) is not None:
-                    return found
+                return self._run_on_floats(arrays, self._on_floats)
             except (ArithmeticError, ValueError):  # a number is not finite
                 pass
         results = {name: np.array(x, float) if name in self._written else x for name, x in arrays.items()}
@@ -94,25 +106,6 @@ class ArrayLoops:
         lists = {name: np.asarray(x, float).tolist() for name, x in arrays.items() if name in involved}
         run(lists)
         return {name: np.array(lists[name], float) if name in self._written else x for name, x in arrays.items()}
-
-    def _run_at_many(self, arrays: Mapping[str, Any], loops: FloatLoops) -> dict[str, np.ndarray] | None:
-        """Run on lists of arrays, which have one number for each state; None if that is not worth writing a function."""
-        involved = {name: np.asarray(x, float) for name, x in arrays.items() if name in self._written | self._read}
-        run, count = loops.of_many(involved.keys()), max((x.shape[1] for x in involved.values()), default=1)
-        if run is None:
-            return None
-        # A number that is the same for all states is a float, with which NumPy computes faster.
-        lists: dict[str, list[Any]] = {
-            name: x[:, 0].tolist() if x.shape[1] == 1 else list(np.ascontiguousarray(x)) for name, x in involved.items()
-        }
-        with np.errstate(all="ignore"):
-            run(lists)
-        results = dict(arrays)
-        for name in self._written & lists.keys():
-            results[name] = table = np.empty((len(lists[name]), count))
-            for row, x in zip(table, lists[name], strict=True):
-                row[...] = x
-        return results
 
 
 def _lay_out(part: KernelLoop | Reset) -> LaidOutPart:

@@ -1,10 +1,11 @@
 """Machine code that follows the positions of a driven mechanism from value to value: a batch of members in W lanes.
 
 A step predicts by the third-order Taylor polynomial of q(s), from q', q'' and the change of q'', and corrects once or twice by
-Newton's method with elimination. A position is sound if it is closed up to rounding errors, is near its prediction, has a small rotation
-of the tangent, and is so far from dependent rows that enough digits of q'' are correct. Values that are far apart are reached in
-several steps: each lane halves a step that does not lead to a sound position, and lengthens the steps after one that does. A lane
-stops where even the shortest step fails, at its last sound position; from there the caller continues by singular values.
+Newton's method with elimination. A position is sound if it is closed up to rounding errors, is near its prediction, has a small
+rotation of the tangent, and is so far from dependent rows that enough digits of q'' are correct. Values that are far apart are
+reached in several steps: each lane halves a step that does not lead to a sound position, and lengthens the steps after one that
+does. A lane stops where even the shortest step fails, at its last sound position; from there the caller continues by singular
+values.
 
 If the mechanism has as many independent rows as coordinates, each position has a side, the sign of det Psi_q of these rows. The
 side changes where branches meet, and differs on another branch nearby. If it changes more than once on the way to a value, the

@@ -1,20 +1,22 @@
-"""Programs of loops at single states by machine code, for questions that Python asks again and again.
+"""Programs of loops at states by machine code, for questions that Python asks again and again.
 
-A program is one function of two addresses: the constants of a mechanism, and a block of memory with all other arrays. It is
-compiled quickly, since a run takes a microsecond.
+A program is one function of two addresses: the constants of a mechanism, and a block of memory with all other arrays. For single
+states it is compiled quickly, since a run takes a microsecond; for many, in lanes and with optimization.
 """
 
 import ctypes
 import re
-from collections.abc import Mapping, Sequence
-from itertools import accumulate
+from collections.abc import Callable, Mapping, Sequence
+from itertools import accumulate, pairwise
 from threading import Lock
+from typing import Any, TypeVar
 
 import numpy as np
 
 from udkjax.expressions.loops.compiled_loops import compile_by
 from udkjax.expressions.loops.loop_program import LoopProgram
-from udkjax.native.code import machine
+from udkjax.native.code import machine, processor
+from udkjax.native.language.ir import INT, POINTER, Function
 from udkjax.native.language.loops import LoopWriter
 from udkjax.native.language.program import UnsupportedError
 from udkjax.native.language.text import text_of_module
@@ -57,13 +59,84 @@ class StateLoops:
             return {name: view.copy() for name, view in self._results}
 
 
-def _compile(program: LoopProgram, sizes: Mapping[str, int], results: Sequence[str]) -> StateLoops | None:
-    try:
-        return StateLoops(program, sizes, results)
-    except UnsupportedError:
-        return None
+class LoopsAtMany:
+    """A program of loops as a function of its constants and of the arrays that describe states, in lanes.
+
+    Args:
+        program: the program.
+        sizes: the lengths of all its arrays except `constants` and those of `given`.
+        given: the lengths of the arrays that describe a state.
+        results: the names of the arrays that are returned.
+    """
+
+    def __init__(self, program: LoopProgram, sizes: Mapping[str, int], given: Mapping[str, int], results: Sequence[str]):
+        lengths = {**sizes, **given}
+        places = dict(zip(lengths, [0, *accumulate(lengths.values())], strict=False))
+        self._given, self._results = _rows_of(given), _rows_of({name: lengths[name] for name in results})
+        self._width, self._lock = processor.lanes(), Lock()
+        loops = LoopWriter(self._width)
+        at = {name: ("work", place) for name, place in places.items()} | {"constants": ("constants", 0)}
+        loops.write(program, "evaluate", ("constants", "work"), at)
+        text = text_of_module([*loops.functions, self._write(places)], loops.globals)
+        self._library = machine.library(text, ["evaluate_all"])
+        self._run = machine.function(self._library["evaluate_all"], *[ctypes.c_void_p] * 4, ctypes.c_int64)
+        self._work = np.zeros(sum(lengths.values()) * self._width)
+
+    def _write(self, places: Mapping[str, int]) -> Function:
+        """Write `evaluate_all(constants, work, given, found, blocks)`, whose arrays have a row for each number of a state."""
+        width, arguments = self._width, [(POINTER, x) for x in ("constants", "work", "given", "found")]
+        f = Function("evaluate_all", [*arguments, (INT, "blocks")], width)
+        work, stride = f.given["work"], f.given["blocks"] * width
+        with f.each(f.given["blocks"]) as k:
+            for name, rows in self._given.items():
+                with f.each(rows.stop - rows.start) as i:
+                    x = f.load(f.given["given"], (i + rows.start) * stride + k * width, width)
+                    f.store(x, work, (i + places[name]) * width, width)
+            f.call("evaluate", f.given["constants"], work)
+            for name, rows in self._results.items():
+                with f.each(rows.stop - rows.start) as i:
+                    x = f.load(work, (i + places[name]) * width, width)
+                    f.store(x, f.given["found"], (i + rows.start) * stride + k * width, width)
+        return f
+
+    def __call__(self, constants: np.ndarray, given: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """Return the results (..., T) for constants, in float64, and arrays (..., T) or (..., 1) by name."""
+        count = max(x.shape[1] for x in given.values())
+        blocks = -(-count // self._width)
+        states, found = (np.empty((_count(rows), blocks * self._width)) for rows in (self._given, self._results))
+        for name, rows in self._given.items():
+            states[rows, :count], states[rows, count:] = given[name], given[name][:, :1]
+        in_lanes = np.repeat(constants, self._width)
+        with self._lock:
+            self._run(*[x.__array_interface__["data"][0] for x in (in_lanes, self._work, states, found)], blocks)
+        return {name: found[rows, :count] for name, rows in self._results.items()}
+
+
+def _rows_of(sizes: Mapping[str, int]) -> dict[str, slice]:
+    """Return the rows of arrays that stand below each other."""
+    ends = [0, *accumulate(sizes.values())]
+    return {name: slice(*rows) for name, rows in zip(sizes, pairwise(ends), strict=True)}
+
+
+def _count(rows: Mapping[str, slice]) -> int:
+    return max((x.stop for x in rows.values()), default=0)
+
+
+Compiled = TypeVar("Compiled")
+
+
+def _if_supported(compiler: Callable[..., Compiled]) -> Callable[..., Compiled | None]:
+    """Return a compiler that returns None for a program which machine code cannot hold."""
+
+    def compiled(*arguments: Any) -> Compiled | None:
+        try:
+            return compiler(*arguments)
+        except UnsupportedError:
+            return None
+
+    return compiled
 
 
 def register() -> None:
-    """Let programs of loops be compiled that Python runs often at single states."""
-    compile_by(_compile)
+    """Let programs of loops be compiled that Python runs often."""
+    compile_by(_if_supported(StateLoops), _if_supported(LoopsAtMany))

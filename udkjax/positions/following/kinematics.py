@@ -263,9 +263,9 @@ def _kinematics(
 ) -> Kinematics:
     xp = by.xp
     points = _solve(driven, driven.value(q) if driven.name else values[0], q, values, by)
-    rate, acceleration = (xp.broadcast_to(x, values.shape) for x in (rate, acceleration))
-    v = points.dq * rate[:, None]
-    a = points.ddq * rate[:, None] ** 2 + points.dq * acceleration[:, None]
+    s_dot, s_ddot = (x[:, None] if x.ndim else x for x in (rate, acceleration))
+    v = points.dq * s_dot
+    a = points.ddq * s_dot**2 + points.dq * s_ddot
     q, v, a = (xp.reshape(x, (len(values), -1, 3)) for x in (points.q, v, a))
     limit_q, unit = points.limit_q.reshape(-1, 3), driven.value_unit
     return make_module(
@@ -274,7 +274,7 @@ def _kinematics(
         q=q,
         v=v,
         a=a,
-        rate=rate,
+        rate=xp.broadcast_to(rate, values.shape),
         status=points.status,
         limit=points.limit,
         limit_q=limit_q,
@@ -340,12 +340,16 @@ def _solve(
     if fast and can_march(driven.mechanism, driven.analysis):
         found = march(*stop_gradients(given)) if is_traced else march_at_once(*given)
         first = _count_on_branch(curve, s, q, values, found)
-        s, q = _place_to_go_on(s, q, values, found, first, xp)
+        if is_traced or first < len(values):
+            s, q = _place_to_go_on(s, q, values, found, first, xp)
         points = points._replace(q=found.q, dq=found.dq, ddq=found.ddq, status=xp.zeros_like(points.status))
     if not is_traced:
         points = follow(curve, s, q, values, points, first)
-        has_position = Reached.has_position(points.status)[:, None]
-        return points._replace(**{name: np.where(has_position, getattr(points, name), np.nan) for name in ("q", "dq", "ddq")})
+        has_position = Reached.has_position(points.status)
+        if has_position.all():
+            return points
+        known = {name: np.where(has_position[:, None], getattr(points, name), np.nan) for name in ("q", "dq", "ddq")}
+        return points._replace(**known)
     assert isinstance(curve, Curve)
     points = follow(*stop_gradients((curve, s, q, values)), points, first)
     return _with_derivatives(curve, q, values, points)
