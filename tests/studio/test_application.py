@@ -335,7 +335,7 @@ def test_a_name_is_not_a_formula_in_a_table(client):
 def test_motors_that_contradict_each_other_are_named(client):
     text = ARMS.replace('{pin = "O", speed = 1}', '{pin = "O", speed = 1}, {pin = "C", speed = -3}')
     found = client.ask("diagnose", text=text).json()
-    assert found["conflict"] == 'motors "motor1" and "motor2" contradict each other: remove one, or change its motion.'
+    assert found["conflict"] == 'motors "motor1" and "motor2" contradict each other: delete one, or change its speed.'
     assert client.ask("diagnose", text=ARMS).json()["conflict"] == ""
 
 

@@ -142,7 +142,7 @@ def _conflict(mechanism: Mechanism) -> str:
     try:
         assemble(mechanism)
     except AssemblyError as error:
-        return str(error).replace("driver", "motor")
+        return str(error)
     return ""
 
 

@@ -90,7 +90,8 @@ def holding_curves(mechanism: Mechanism) -> JsonObject:
         SceneError: motors do not hold the whole mechanism.
     """
     if mobility_of(mechanism) > 0:
-        raise SceneError(["motors do not hold the whole mechanism at rest: loads would move the rest of it"])
+        cure = "put a motor on what still moves (Motor, M), or ask for the Equilibrium"
+        raise SceneError([f"motors do not hold the whole mechanism at rest: {cure}"])
     run = shown_run(mechanism)
     halted = with_halted_drivers(mechanism, 0.0)
     positions = RestingPositions(run.ts, run.q, np.zeros_like(np.asarray(run.v)))

@@ -24,6 +24,7 @@ from udkjax.studio.findings import examine
 from udkjax.studio.limits import RefusedError, require_few, require_size
 from udkjax.studio.shown_runs import duration_of, effort_name, recorded_motion
 from udkjax.studio.text_edits import merge_document, read_document
+from udkjax.studio.wording import in_studio_words, studio_words
 
 Maker = Callable[[], Mechanism]
 # Templates for new drawings, files of the folder `drawings`: mechanisms that a motor or a spring moves.
@@ -128,11 +129,11 @@ def compile_drawing(text: str = "", document: Mapping[str, Any] | None = None, e
             raise SceneError(["format: the studio draws files of format 2"])
         Analysis.require_masses(mechanism, "free motions")
     except (SceneError, ArgumentError) as error:
-        problems = list(error.problems) if isinstance(error, SceneError) else [str(error)]
+        problems = list(error.problems) if isinstance(error, SceneError) else [studio_words(str(error))]
         return {"text": text, "document": _read(text), "problems": problems, "scene": None}
     engine_data = engine_of(mechanism, tables) if engine == "wasm" else {}
     if engine == "recorded":
-        engine_data = {"motion": recorded_motion(mechanism)}
+        engine_data = {"motion": in_studio_words(recorded_motion(mechanism))}
     found = {"text": text, "document": tables, "problems": [], "scene": scene_of(mechanism), **engine_data}
     return found | {"outlines": outlines_of_files(mechanism.drawing, tables)}
 
@@ -158,8 +159,8 @@ def engine_of(mechanism: Mechanism, document: JsonObject) -> JsonObject:
             undriven = _by_coordinates(loads(merge_document("", _undriven(document))))
             hand = portable_engine(undriven, names, pull=False, runs=False).data
     except (UnsupportedError, SceneError) as error:
-        return {"why": str(error)}
-    return {"engine": engine, "hand": hand, "pins": pins, "why": engine["why"]}
+        return {"why": studio_words(str(error))}
+    return {"engine": engine, "hand": hand, "pins": pins, "why": studio_words(engine["why"])}
 
 
 def _by_coordinates(mechanism: Mechanism) -> Mechanism:
@@ -222,11 +223,11 @@ def diagnose_drawing(text: str, about: str = "structure", end: JsonObject | None
     """Return the findings about a drawing; `about` is a subject of findings.py, and `end` that of a run."""
     try:
         require_few(read_document(text))
-        return examine(loads(text), text, about, end)
+        return in_studio_words(examine(loads(text), text, about, end))
     except SceneError as error:
-        return {"problems": list(error.problems)}
+        return in_studio_words({"problems": list(error.problems)})
     except ArgumentError as error:  # such as links without mass
-        return {"problems": [str(error)]}
+        return in_studio_words({"problems": [str(error)]})
 
 
 def export(text: str, suffix: str) -> JsonObject:
@@ -236,8 +237,9 @@ def export(text: str, suffix: str) -> JsonObject:
         mechanism = loads(text)
         data = exported(mechanism, text, suffix)
         return {"data": data.hex()}
-    except SceneError as error:
-        raise RefusedError(422, "; ".join(error.problems)) from None
+    except (SceneError, ArgumentError) as error:
+        problems = error.problems if isinstance(error, SceneError) else [str(error)]
+        raise RefusedError(422, studio_words("; ".join(problems))) from None
     except ImportError as error:
         raise RefusedError(422, str(error)) from None
 

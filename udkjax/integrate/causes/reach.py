@@ -11,8 +11,8 @@ import numpy as np
 
 from udkjax.equations.rows.redundancy import holders_of_driver
 from udkjax.integrate.causes.failed_run import FailedRun
+from udkjax.positions.answers.counting import Count
 from udkjax.scene.elements.bodies import GROUND
-from udkjax.scene.elements.drivers import Driver
 from udkjax.scene.elements.joints import Revolute
 from udkjax.scene.mechanism import Mechanism
 
@@ -45,14 +45,14 @@ def explain_reach(run: FailedRun, until: float) -> str:
     if not names:
         return ""
     opposed = holders_of_driver(mechanism, names[-1]) is not None
-    demands = " and ".join(f'driver "{name}" asks for {_value(mechanism.drivers[name], until)}' for name in names)
+    demands = " and ".join(f'driver "{name}" asks for {_value(mechanism, name, until)}' for name in names)
     where = f"at {until:.6g} s"
     if opposed and len(names) > 1:
         listed = " and ".join(f'"{name}"' for name in names)
         return f"drivers {listed} contradict each other: {demands} {where}; remove one, or change its motion"
     if opposed:
         return f"{demands} {where}, where the joints leave its coordinate no motion; remove the driver, or free the coordinate"
-    reached = " and ".join(_value(mechanism.drivers[name], reach.t) for name in names)
+    reached = " and ".join(_value(mechanism, name, reach.t) for name in names)
     point = dead_point(mechanism, reach, names)
     return f"{demands} {where}; the linkage reaches {reached}, at {reach.t:.6g} s ({point})"
 
@@ -139,5 +139,10 @@ def dead_point(mechanism: Mechanism, found: Reach, drivers: list[str]) -> str:
     return f"a dead point of {', '.join(joints)}" if joints else "a dead point"
 
 
-def _value(driver: Driver, t: float) -> str:
-    return f"{float(driver.motion(t)):.6g} {'rad' if driver.coordinate == 'angle' else 'm'}"
+def _value(mechanism: Mechanism, name: str, t: float) -> str:
+    """Return the value of a driver at a time (s) as text: of a drawing, as its other answers count it, else in rad or m."""
+    driver = mechanism.drivers[name]
+    value = float(driver.motion(t))
+    if mechanism.drawing is not None:
+        return Count.of(mechanism, name).text(value)
+    return f"{value:.6g} {'rad' if driver.coordinate == 'angle' else 'm'}"
