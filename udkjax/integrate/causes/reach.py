@@ -11,7 +11,6 @@ import numpy as np
 
 from udkjax.equations.rows.redundancy import holders_of_driver
 from udkjax.integrate.causes.failed_run import FailedRun
-from udkjax.positions.answers.counting import Count
 from udkjax.scene.elements.bodies import GROUND
 from udkjax.scene.elements.joints import Revolute
 from udkjax.scene.mechanism import Mechanism
@@ -144,5 +143,7 @@ def _value(mechanism: Mechanism, name: str, t: float) -> str:
     driver = mechanism.drivers[name]
     value = float(driver.motion(t))
     if mechanism.drawing is not None:
+        from udkjax.positions.answers.counting import Count  # imports drawings, which a run without one need not
+
         return Count.of(mechanism, name).text(value)
     return f"{value:.6g} {'rad' if driver.coordinate == 'angle' else 'm'}"
