@@ -96,7 +96,7 @@ class SceneArrays(Generic[AnyArray]):
         if many and xp is np:
             state = {"t": np.asarray(t, float).reshape(1, -1), "q": q, "v": v, **given}
             if (compiled := evaluate.at_many(sizes, {name: len(x) for name, x in state.items()})) is not None:
-                return compiled(self._constants, state)
+                return compiled(np.asarray(self._constants), state)
         blank = {x: xp.zeros((size, *many)) for x, size in sizes.items()}
         constants = self._constants[:, None] if many else self._constants
         state = {"constants": constants, "t": xp.reshape(xp.asarray(t, float), (1, *many)), "q": q, "v": v}

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from udkjax.expressions.loops.compiled_loops import CompiledLoops, LoopsAtMany, compiled_at_many, compiled_loops
+from udkjax.expressions.loops.compiled_loops import CompiledAtMany, CompiledLoops, compiled_at_many, compiled_loops
 from udkjax.expressions.loops.float_loops import FloatLoops, LaidOutPart, Lists
 from udkjax.expressions.loops.loop_program import ADD, ALL, MAXIMUM, SET, Address, KernelLoop, LoopProgram, Reset
 from udkjax.expressions.scalars.scalar_program import ScalarProgram
@@ -39,7 +39,7 @@ class ArrayLoops:
         self._parts, self._xp, self._program, self._results = list(map(_lay_out, program.parts)), xp, program, results
         self._calls, self._runs_at_many = 0, 0
         self.compiled: CompiledLoops | None = None  # the same at single states, by machine code
-        self._at_many: LoopsAtMany | None = None  # and at many
+        self._at_many: CompiledAtMany | None = None  # and at many
         self._written = {name for part in self._parts for name, *_ in part.outputs}
         self._read = {name for part in self._parts for name, _ in part.inputs if name}
         self._on_floats = FloatLoops(self._parts) if xp is np and FloatLoops.support(self._parts) else None
@@ -72,7 +72,7 @@ class ArrayLoops:
         """Make `compiled`, if there is a compiler that supports the program; `sizes` has the lengths of all its arrays."""
         self.compiled = compiled_loops(self._program, sizes, tuple(self._results or ()))
 
-    def at_many(self, sizes: Mapping[str, int], given: Mapping[str, int]) -> LoopsAtMany | None:
+    def at_many(self, sizes: Mapping[str, int], given: Mapping[str, int]) -> CompiledAtMany | None:
         """Return the program at many states by machine code; None until it has run so often that it is worth compiling.
 
         Args:

@@ -14,7 +14,7 @@ class CompiledLoops(Protocol):
     def __call__(self, constants: int, given: Mapping[str, np.ndarray | float], /) -> dict[str, Any]: ...
 
 
-class LoopsAtMany(Protocol):
+class CompiledAtMany(Protocol):
     """A program as a function of its constants, and of the arrays that describe states by name, each (n, T) or (n, 1)."""
 
     def __call__(self, constants: np.ndarray, given: Mapping[str, np.ndarray], /) -> dict[str, Any]: ...
@@ -23,7 +23,7 @@ class LoopsAtMany(Protocol):
 # Compiles a program, given the lengths of its arrays except `constants`, and the names of its results; None if it cannot.
 LoopCompiler: TypeAlias = Callable[[LoopProgram, Mapping[str, int], Sequence[str]], CompiledLoops | None]
 # Compiles one for many states, given the lengths of its own arrays and of those of a state, and the names of its results.
-CompilerAtMany: TypeAlias = Callable[[LoopProgram, Mapping[str, int], Mapping[str, int], Sequence[str]], LoopsAtMany | None]
+CompilerAtMany: TypeAlias = Callable[[LoopProgram, Mapping[str, int], Mapping[str, int], Sequence[str]], CompiledAtMany | None]
 _COMPILERS: list[tuple[LoopCompiler, CompilerAtMany]] = []
 
 
@@ -39,6 +39,6 @@ def compiled_loops(program: LoopProgram, sizes: Mapping[str, int], results: Sequ
 
 def compiled_at_many(
     program: LoopProgram, sizes: Mapping[str, int], given: Mapping[str, int], results: Sequence[str]
-) -> LoopsAtMany | None:
+) -> CompiledAtMany | None:
     """Return a program at many states by machine code; None if there is no compiler, or if it cannot hold the program."""
     return _COMPILERS[0][1](program, sizes, given, results) if _COMPILERS else None
