@@ -100,10 +100,11 @@ def power_balance(
         The `PowerBalance` (W). Joints that events add, and contacts that may rest, are among its joints.
     """
     mechanism.require_masses("powers")
-    ts, flat = jnp.asarray(solution.ts), (len(solution.ts), -1)
+    flat = (len(solution.ts), -1)
     q, v = (jnp.asarray(x).reshape(flat) for x in (solution.q, solution.v))
     scene, method = scene_along(mechanism, solution), SVD() if method is None else method
-    by_row, by_force, by_joint, kinetic, potential = _powers(*scene[:3], ts, q, v, method, stabilization)
+    given = jnp.asarray(scene.ts), q, v, method, scene.gains(stabilization)
+    by_row, by_force, by_joint, kinetic, potential = _powers(*scene[:3], *given)
     analysis, owners = scene.analysis, [name for name, _ in scene.analysis.row_names]
     names = {name: (name,) for name in mechanism.constraints} if scene.names is None else scene.names
 

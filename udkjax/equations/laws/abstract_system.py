@@ -6,6 +6,7 @@ from typing import Any, ClassVar, NamedTuple, Protocol, Self, TypeAlias
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from udkjax.annotations import Time, Vector
@@ -32,6 +33,11 @@ class HasStates(Protocol):
 
 
 HistoryLike: TypeAlias = HasStates | SimpleNamespace  # anything with these attributes
+
+
+def times_of(solution: HistoryLike) -> Any:
+    """Return the times (s) at which loads act on the states: zero for all of a `Kinematics` over the values of a driver."""
+    return solution.ts if getattr(solution, "values_of", None) is None else np.zeros(np.shape(solution.ts))
 
 
 class TangentPart(NamedTuple):

@@ -10,7 +10,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from udkjax.annotations import NumberLike, Vector
 from udkjax.argument_types import COORDINATES_OF_BODIES, HISTORY
-from udkjax.equations.laws.abstract_system import AbstractSystem, ConstrainedRows, HistoryLike
+from udkjax.equations.laws.abstract_system import AbstractSystem, ConstrainedRows, HistoryLike, times_of
 from udkjax.equations.laws.formulations import Formulation
 from udkjax.equations.laws.udwadia_kalaba import Baumgarte
 from udkjax.equations.rows.analysis import Analysis, analysis_of
@@ -171,23 +171,14 @@ def violation(mechanism: Mechanism | ConstrainedSystem, solution: Annotated[Hist
     """
     changes: SceneChanges | None = getattr(solution, "scene_changes", None)
     driver: str | None = getattr(solution, "values_of", None)
-    states = solution if driver is None else _States(0.0 * solution.ts, solution.q, solution.v)
-    if by_numpy(mechanism, (states.ts, states.q)):
-        ts, q = history_of(states)[:2]
+    if by_numpy(mechanism, (solution.ts, solution.q)):
+        ts, q = history_of(solution)[:2]
         psi = jax.device_put(state_arrays(mechanism.without_origin).psi(ts, q))
     else:
-        psi = _evaluate_along(mechanism, states, _residuals)
+        psi = _evaluate_along(mechanism, solution, _residuals)
     if driver is not None and mechanism.has_bodies:
         return _over_values(mechanism, psi, driver, solution.ts)
     return psi if changes is None else jnp.where(changes.rows_that_hold(mechanism), psi, 0.0)
-
-
-class _States(NamedTuple):
-    """States at times."""
-
-    ts: Any
-    q: Any
-    v: Any
 
 
 def _over_values(mechanism: Any, psi: Float[Array, "T m"], driver: str, values: Any) -> Float[Array, "T m"]:
@@ -243,13 +234,14 @@ def efforts(
     if not mechanism.driver_names:
         return {}
     scene, method = scene_along(mechanism, solution), SVD() if method is None else method
-    analysis, given = scene.analysis, (solution.ts, solution.q, solution.v, scene.analysis, stabilization)
-    if scene.knowledge.changes is None and by_numpy(mechanism, given, method):
-        arrays, (ts, q, v) = state_arrays(mechanism.without_origin), history_of(solution)
+    analysis, stabilization = scene.analysis, scene.gains(stabilization)
+    given = scene.ts, solution.q, solution.v, analysis, stabilization
+    if scene.knowledge.is_constant and by_numpy(scene.mechanism, given, method):
+        arrays, (ts, q, v) = state_arrays(scene.mechanism), history_of(solution)
         pieces = [arrays.solve(ts[p], q[p], v[p], analysis, method, stabilization) for p in arrays.pieces(len(ts))]
         multipliers = jax.device_put(np.concatenate([piece.multipliers for piece in pieces]))
     else:
-        ts, q, v = (jnp.asarray(x) for x in (solution.ts, solution.q, solution.v))
+        ts, q, v = (jnp.asarray(x) for x in given[:3])
         multipliers = _multipliers(*scene[:3], ts, q, v, method, stabilization)
     rows = {owner: k for k, (owner, _) in enumerate(analysis.row_names)}
     return {name: -multipliers[:, rows[name]] for name in mechanism.driver_names}
@@ -283,8 +275,8 @@ def friction_loads(
     frictions = {name: force for name, force in scene.mechanism.forces.items() if isinstance(force, Friction)}
     if not frictions:
         return {}
-    ts, q, v = (jnp.asarray(x, float) for x in (solution.ts, solution.q, solution.v))
-    by_name = _friction_loads(*scene[:3], ts, q, v, SVD() if method is None else method, stabilization)
+    ts, q, v = (jnp.asarray(x, float) for x in (scene.ts, solution.q, solution.v))
+    by_name = _friction_loads(*scene[:3], ts, q, v, SVD() if method is None else method, scene.gains(stabilization))
     bodies = {
         name: [b for b in dict.fromkeys(scene.mechanism.frames_of(force)) if b != GROUND] for name, force in frictions.items()
     }
@@ -336,7 +328,7 @@ def _energy(equations: ConstrainedRows, t: Array, q: Vector, v: Vector) -> Energ
 
 def _evaluate_along(mechanism: Model, solution: HistoryLike, quantity: Callable[..., Result]) -> Result:
     model = mechanism.without_origin.traced(np.shape(solution.q)[-1])
-    return _evaluate(model, analysis_of(mechanism), solution.ts, solution.q, solution.v, quantity)
+    return _evaluate(model, analysis_of(mechanism), times_of(solution), solution.q, solution.v, quantity)
 
 
 @deferred

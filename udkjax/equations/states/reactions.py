@@ -17,7 +17,7 @@ from udkjax.annotations import Number, NumberLike
 from udkjax.argument_types import ARRAYS_BY_NAME, HISTORY, NOT_NEGATIVE
 from udkjax.arrays import ArrayLibrary, array_namespace
 from udkjax.equations.friction.compliance import compliance_rows
-from udkjax.equations.laws.abstract_system import HistoryLike
+from udkjax.equations.laws.abstract_system import HistoryLike, times_of
 from udkjax.equations.laws.udwadia_kalaba import Baumgarte
 from udkjax.equations.rows.analysis import Analysis
 from udkjax.equations.rows.determinacy import STATIC_RANK_TOL, UNIQUE_TOL, left_null_space
@@ -84,8 +84,13 @@ def reactions(
         states = _states(solution)
         return _loads_of_rows(mechanism.traced(states[1].shape[-1]), *states, SVD() if method is None else method, stabilization)
     scene, method, states = scene_along(mechanism, solution), SVD() if method is None else method, _states(solution)
+    stabilization = scene.gains(stabilization)
     soft = None if compliances is None else compliance_rows(scene.mechanism, compliances)
-    if soft is None and scene.knowledge.changes is None and by_numpy(mechanism, (states, scene.analysis, stabilization), method):
+    if (
+        soft is None
+        and scene.knowledge.is_constant
+        and by_numpy(scene.mechanism, (states, scene.analysis, stabilization), method)
+    ):
         loads = _loads_by_numpy(*scene[:2], history_of(solution), method, stabilization, frame=frame, about=about)
     else:
         loads = _loads(*scene[:3], *states, method, stabilization, soft, frame, about)
@@ -115,7 +120,7 @@ def unique_reactions(
         For each joint and driver, and each of its bodies, booleans (T, 3) for force x, force y and torque.
     """
     scene, (ts, q, _) = scene_along(mechanism, solution), _states(solution)
-    if scene.knowledge.changes is None and by_numpy(mechanism, (ts, q, scene.analysis, rank_tol)):
+    if scene.knowledge.is_constant and by_numpy(scene.mechanism, (ts, q, scene.analysis, rank_tol)):
         marks = _uniqueness_by_numpy(*scene[:2], history_of(solution)[:2], rank_tol, frame, about)
     else:
         marks = _uniqueness_of_loads(*scene[:3], ts, q, jnp.asarray(rank_tol), frame, about)
@@ -228,7 +233,7 @@ def _joint_point(element: Constraint, k: int, frames: list[Frame]) -> Point | No
 
 
 def _states(solution: HistoryLike) -> tuple[Array, Array, Array]:
-    ts = jnp.asarray(solution.ts)
+    ts = jnp.asarray(times_of(solution))
     return ts, jnp.asarray(solution.q).reshape(len(ts), -1), jnp.asarray(solution.v).reshape(len(ts), -1)
 
 

@@ -16,13 +16,16 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from udkjax.annotations import TreeDef
-from udkjax.arrays import is_array, number
+from udkjax.arrays import is_array, is_traced, number
 from udkjax.equations.friction import rubbing
 from udkjax.equations.friction.sticking_state import known_sticking
+from udkjax.equations.laws.abstract_system import times_of
+from udkjax.equations.laws.udwadia_kalaba import Baumgarte
 from udkjax.equations.rows.analysis import Analysis, analyse
 from udkjax.equations.terms.switches import switch, switched, with_switches
 from udkjax.programs.identity_cache import cached_by_identity, is_concrete
 from udkjax.requirements import ArgumentError
+from udkjax.scene.elements.drivers import Polynomial
 from udkjax.scene.elements.friction import Friction
 from udkjax.scene.elements.joints import Constraint, Joint
 from udkjax.scene.mechanism import Mechanism
@@ -177,11 +180,16 @@ class KnownState(eqx.Module):
     active: Float[Array, "C"] | None = None  # whether each switched constraint holds; None: the scene does not change
     added: tuple[tuple[Array, ...], ...] = ()  # the numbers of the joints that events have added
     unknown: Bool[Array, ""] | None = None  # whether the constraints that hold are not known
+    driven: Float[Array, "3"] | None = None  # coefficients of the motion of a driver; None: drivers move in time
     names: tuple[str, ...] = eqx.field(static=True, default=())  # the switched constraints
     names_added: tuple[str, ...] = eqx.field(static=True, default=())
+    driver: str = eqx.field(static=True, default="")
 
     def put_in(self, mechanism: Mechanism) -> Mechanism:
         """Return the scene of this state; its loads are NaN if it is not known."""
+        if self.driven is not None:
+            k = mechanism.driver_names.index(self.driver)
+            mechanism = eqx.tree_at(lambda m: m._drivers[k].motion.coefficients, mechanism, self.driven)
         if self.active is None:
             return mechanism
         for name, numbers in zip(self.names_added, self.added, strict=True):
@@ -201,12 +209,19 @@ class Knowledge(NamedTuple):
 
     sticking: Bool[Array, "T F"] | None
     changes: SceneChanges | None
+    driver: str = ""  # the one whose motion differs from state to state
+    driven: Float[Array, "T 3"] | None = None  # the coefficients of its motion
+
+    @property
+    def is_constant(self) -> bool:
+        """True if the same constraints and motions hold at all times."""
+        return self.changes is None and self.driven is None
 
     def states(self, mechanism: Mechanism) -> KnownState:
         """Return the constraints at each time, for the mechanism with all constraints of the run."""
         changes = self.changes
         if changes is None:
-            return KnownState(self.sticking)
+            return KnownState(self.sticking, driven=self.driven, driver=self.driver)
         known = [k for k, name in enumerate(changes.names) if name in mechanism.constraints]
         count = changes.places.shape[1] if changes.is_known else 0
         joints, names = changes.elements[0][:count], changes.names[changes.of_scene :][:count]
@@ -233,6 +248,12 @@ class SceneAlong(NamedTuple):
     analysis: Analysis
     knowledge: Knowledge
     names: Mapping[str, Sequence[str]] | None  # its constraints by the name by which results list them; None: by their own
+    ts: Any  # times (T,) of loads and of motions
+    is_kinematic: bool = False  # whether the motion is that of a `Kinematics` over the values of a driver
+
+    def gains(self, stabilization: Baumgarte | None) -> Baumgarte | None:
+        """Return the gains of Baumgarte's terms, of which a kinematic motion has none."""
+        return None if self.is_kinematic else stabilization
 
 
 def scene_along(mechanism: Any, solution: Any) -> SceneAlong:
@@ -245,12 +266,14 @@ def scene_along(mechanism: Any, solution: Any) -> SceneAlong:
     Raises:
         ArgumentError: the solution's times do not belong to its `scene_changes`.
     """
-    analysis = analyse(mechanism)
+    analysis, ts = analyse(mechanism), times_of(solution)
+    if getattr(solution, "values_of", None) is not None and mechanism.driver_names:
+        return _over_values(mechanism, solution, analysis, ts)
     changes: SceneChanges | None = getattr(solution, "scene_changes", None)
     if changes is None:
         sticking = getattr(solution, "sticking", None)
         known = known_sticking(mechanism, sticking) if sticking else None
-        return SceneAlong(mechanism.without_origin, analysis, Knowledge(known, None), None)
+        return SceneAlong(mechanism.without_origin, analysis, Knowledge(known, None), None, ts)
     if len(changes.holds) != len(solution.ts):
         count = f"{len(solution.ts)} times, and its scene_changes {len(changes.holds)}"
         raise ArgumentError(f"solution: it has {count}: select times of all fields, or leave scene_changes out")
@@ -259,4 +282,30 @@ def scene_along(mechanism: Any, solution: Any) -> SceneAlong:
     sticking = getattr(solution, "sticking", None) or {}
     sticking = sticking | {joint: sticking[name] for joint, name in contacts.items() if name in sticking}
     knowledge = Knowledge(known_sticking(whole, sticking), changes)
-    return SceneAlong(whole, analysis.with_rows_of(whole), knowledge, changes.constraints_of(mechanism))
+    return SceneAlong(whole, analysis.with_rows_of(whole), knowledge, changes.constraints_of(mechanism), ts)
+
+
+def _over_values(mechanism: Mechanism, motion: Any, analysis: Analysis, ts: np.ndarray) -> SceneAlong:
+    """Return the mechanism along a `Kinematics` over the values of a driver: it has these at time 0, all others hold theirs."""
+    name, scene = motion.values_of, mechanism.without_origin
+    if name not in mechanism.driver_names:
+        return SceneAlong(_with_motions(scene), analysis, Knowledge(None, None), None, ts, True)
+    numbers = motion.values, motion.rate, motion.acceleration
+    if not is_traced(numbers):
+        rates = np.unique(np.stack([np.asarray(x, float) for x in numbers[1:]]), axis=1)
+        if rates.shape[1] == 1:
+            scene = _with_motions(scene, name, *rates[:, 0].tolist())
+            return SceneAlong(scene, analysis, Knowledge(None, None), None, ts, True)
+    value, rate, acceleration = (jnp.asarray(x) for x in numbers)
+    coefficients = jnp.stack([value, rate, 0.5 * acceleration], -1)
+    return SceneAlong(_with_motions(scene, name), analysis, Knowledge(None, None, name, coefficients), None, ts, True)
+
+
+@cached_by_identity(within_trace=True)
+def _with_motions(mechanism: Mechanism, name: str = "", rate: float = 0.0, acceleration: float = 0.0) -> Mechanism:
+    """Return the mechanism with a driver of this rate and acceleration at time 0; all others are at rest."""
+    moving, resting = Polynomial(np.array([0.0, rate, 0.5 * acceleration])), Polynomial(np.zeros(1))
+    drivers = mechanism.drivers.items()
+    return mechanism.with_drivers(
+        {key: eqx.tree_at(lambda d: d.motion, x, moving if key == name else resting) for key, x in drivers}
+    )

@@ -14,7 +14,7 @@ from jaxtyping import PyTree
 
 from udkjax.arrays import is_traced, is_within_jit
 from udkjax.equations.elimination.dense_pseudoinverse import FEW_ROWS, dense_pseudoinverse, has_independent_rows
-from udkjax.equations.laws.abstract_system import HistoryLike
+from udkjax.equations.laws.abstract_system import HistoryLike, times_of
 from udkjax.equations.laws.udwadia_kalaba import Baumgarte
 from udkjax.equations.programs.scene_arrays import SceneArrays, arrays_in_time
 from udkjax.equations.rows.analysis import Analysis
@@ -59,7 +59,7 @@ StateArraysOverTime: TypeAlias = tuple[np.ndarray, np.ndarray, np.ndarray]  # ti
 
 def history_of(solution: HistoryLike) -> StateArraysOverTime:
     """Return times (T,), coordinates and velocities (T, n) as NumPy arrays."""
-    ts = np.asarray(solution.ts, float)
+    ts = np.asarray(times_of(solution), float)
     q, v = (np.asarray(x, float).reshape(len(ts), -1) for x in (solution.q, solution.v))
     return ts, q, v
 

@@ -124,7 +124,7 @@ def _fill(
     q, v = (jnp.where(jnp.expand_dims(valid, axes), x, jax.lax.stop_gradient(x0)) for valid, x, x0 in filled)
     a = getattr(solution, "a", None)
     a = None if a is None else jnp.where(reached[:, None, None], a, 0.0)
-    return _Motion(mechanism, solution.ts, q, v, a, scene), placed, reached
+    return _Motion(mechanism, solution.ts if scene is None else scene.ts, q, v, a, scene), placed, reached
 
 
 POSITIONS = ("x", "y", "angle", "distance")  # quantities that do not depend on velocities
@@ -155,7 +155,7 @@ class _Motion:
     def dynamics(self) -> _Dynamics:
         """The solution of the equations of motion, computed only if a channel needs it."""
         assert self.scene is not None  # a channel that needs it asks for it
-        mechanism, analysis, knowledge, _ = self.scene
+        mechanism, analysis, knowledge = self.scene[:3]
         equations: Any = equations_of(mechanism, SVD(), analysis=analysis)
 
         def at(t, q, v, known):

@@ -166,13 +166,17 @@ def _add_driver(mechanism: Mechanism, name: str, element: Coordinate, t: NumberL
     return with_drivers(mechanism, {**_halted(mechanism, t), name: element.driver(ValueMotion())}, origin=origin)
 
 
-def with_halted_drivers(mechanism: Mechanism, t: NumberLike) -> Mechanism:
-    """Return the mechanism with its drivers halted at time t (s)."""
-    return mechanism.with_drivers(_halted(mechanism, t))
+def with_halted_drivers(mechanism: Mechanism, t: NumberLike, q: Any = None) -> Mechanism:
+    """Return the mechanism with its drivers halted at time t (s), or in a position q (bodies, 3)."""
+    return mechanism.with_drivers(_halted(mechanism, t, q))
 
 
-def _halted(mechanism: Mechanism, t: NumberLike) -> dict[str, Driver]:
-    return {key: eqx.tree_at(lambda d: d.motion, d, constant_motion(d.motion(number(t)))) for key, d in mechanism.drivers.items()}
+def _halted(mechanism: Mechanism, t: NumberLike, q: Any = None) -> dict[str, Driver]:
+    def halted(name: str, driver: Driver) -> Driver:
+        value: Any = driver.motion(number(t)) if q is None else value_of(mechanism, name)(q)
+        return eqx.tree_at(lambda d: d.motion, driver, constant_motion(value))
+
+    return {name: halted(name, driver) for name, driver in mechanism.drivers.items()}
 
 
 def _with_driver(mechanism: Mechanism, name: str, element: Coordinate, motion: Polynomial) -> Mechanism:

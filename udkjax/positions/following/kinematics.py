@@ -57,6 +57,7 @@ class Kinematics(PrintsTable):
     v: Float[Array, "T bodies 3"]
     a: Float[Array, "T bodies 3"]
     rate: Float[Array, "T"]  # s_dot of the driver
+    acceleration: Float[Array, "T"]  # s_ddot
     status: Int[Array, "T"]
     limit: Float[Array, ""]
     limit_q: Float[Array, "bodies 3"]
@@ -90,6 +91,11 @@ class Kinematics(PrintsTable):
     def ts(self) -> Float[Array, "T"]:
         """The values, as times: a kinematic motion over times can replace a `Solution`."""
         return self.values
+
+    @property
+    def slopes(self) -> Float[Array, "T bodies 3"]:
+        """The derivatives of q by the values (m, m, rad per unit of the values); NaN where `rate` is zero."""
+        return stored(self.v / self.rate[..., None, None])
 
     def frame(self, body: str) -> Frame:
         """Return the frame of a body, each of its numbers (T,)."""
@@ -275,6 +281,7 @@ def _kinematics(
         v=v,
         a=a,
         rate=xp.broadcast_to(rate, values.shape),
+        acceleration=xp.broadcast_to(acceleration, values.shape),
         status=points.status,
         limit=points.limit,
         limit_q=limit_q,

@@ -156,9 +156,7 @@ def _gap_by_chords(kind: str, place: PosesNear, pair: ClosestPair, fixed: Any, y
 
 
 def _cubic(run: Any, k: int) -> RunPoses:
-    ts, q, v = (jnp.asarray(x)[k : k + 2] for x in (run.ts, run.q, run.v))
-    rate = getattr(run, "rate", None)
-    v = v if rate is None else v / jnp.broadcast_to(jnp.asarray(rate), jnp.shape(run.ts))[k : k + 2, None, None]
+    ts, q, v = (jnp.asarray(x)[k : k + 2] for x in (run.ts, run.q, getattr(run, "slopes", run.v)))
     return RunPoses(ts, jnp.stack([q, v]))
 
 

@@ -81,9 +81,7 @@ def de_casteljau(stage: Any, t: Any, h: Any) -> tuple[np.ndarray, np.ndarray]:
 
 def motion_of_run(run: StateHistory) -> PolynomialMotion:
     """Return the motion of a run: between output times, the cubics through positions and velocities."""
-    ts, q, v = (np.asarray(x, float) for x in (run.ts, run.q, run.v))
-    rate = getattr(run, "rate", None)
-    v = v if rate is None else v / np.broadcast_to(np.asarray(rate, float), ts.shape)[:, None, None]
+    ts, q, v = (np.asarray(x, float) for x in (run.ts, run.q, getattr(run, "slopes", run.v)))
     q, v = (np.concatenate([x, 0.0 * x[:, :1]], 1) for x in (q, v))
     third = np.diff(ts)[:, None, None] / 3
     points = np.stack([q[:-1], q[:-1] + third * v[:-1], q[1:] - third * v[1:], q[1:]])

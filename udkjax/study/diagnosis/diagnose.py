@@ -6,6 +6,7 @@ import numpy as np
 
 from udkjax.argument_types import HISTORY, NOT_NEGATIVE, POSITIVE
 from udkjax.equations import determinacy
+from udkjax.equations.laws.abstract_system import times_of
 from udkjax.equations.rows.analysis import hold_pins
 from udkjax.equations.rows.position_closure import is_closed
 from udkjax.equations.states.quantities import equations_of
@@ -13,6 +14,8 @@ from udkjax.equations.systems.general import ConstrainedSystem
 from udkjax.pinv import SVD
 from udkjax.positions.assembling.assembly import Closure, State, close, require_closed
 from udkjax.positions.assembling.channels import StateHistory
+from udkjax.positions.following.drive import with_halted_drivers
+from udkjax.positions.following.kinematics import Kinematics
 from udkjax.requirements import concrete_only
 from udkjax.scene.arguments import checked
 from udkjax.scene.elements.joints import Revolute, Weld
@@ -59,7 +62,7 @@ def diagnose(
     Args:
         mechanism: mechanism with concrete numbers, or a `ConstrainedSystem`, whose rows are Psi_q and phi_v, not scaled.
         state: the configuration, closed first; by default the initial guess, or the start of `solution`.
-        solution: a trajectory, for the `timeline`.
+        solution: a trajectory, for the `timeline`; a `Kinematics` over values of a driver has one over these.
         t: time (s) of the configuration, for drivers.
         rank_tol: singular values of J up to this fraction of the largest count as zero.
         time_tol: half-width of the brackets around times of rank changes (s); by default 1e-9 of the characteristic time.
@@ -74,7 +77,10 @@ def diagnose(
         ValueError: numbers of the mechanism are traced.
     """
     if state is None and solution is not None:
-        state, t = State(solution.q[0], solution.v[0]), float(solution.ts[0])
+        state, t = State(solution.q[0], solution.v[0]), float(times_of(solution)[0])
+    if state is not None and isinstance(solution, Kinematics) and solution.values_of is not None:
+        assert isinstance(mechanism, Mechanism)
+        mechanism = with_halted_drivers(mechanism, t, state.q)
     if isinstance(mechanism, ConstrainedSystem):
         return diagnose_system(mechanism, state, float(t), rank_tol, solution, time_tol)
     closure = close(mechanism, t, state)

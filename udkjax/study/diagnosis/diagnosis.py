@@ -311,10 +311,11 @@ def _pose(result: Diagnosis, change: RankChange) -> str:
 
 def _timeline(line: Timeline) -> list[str]:
     generic_rank = int(line.rank.max(initial=0))
-    lines = [f"{line.ts[0]:g} to {line.ts[-1]:g} s, {len(line.ts)} output times: rank {generic_rank}"]
+    counted = f"{len(line.ts)} output {'times' if line.unit == 's' else 'values'}"
+    lines = [f"{line.ts[0]:g} to {line.ts[-1]:g} {line.unit}, {counted}: rank {generic_rank}"]
     time, smallest = line.closest
-    lines[0] += f"; the smallest nonzero singular value has its minimum, {smallest:.3g} of the largest, at {time:.6g} s"
+    lines[0] += f"; the smallest nonzero singular value has its minimum, {smallest:.3g} of the largest, at {time:.6g} {line.unit}"
     for change in line.changes:
         half = (change.latest - change.earliest) / 2
-        lines.append(f"  rank {change.rank} at {change.time:.10g} s (+- {half:.1g} s)")
+        lines.append(f"  rank {change.rank} at {change.time:.10g} {line.unit} (+- {half:.1g} {line.unit})")
     return lines

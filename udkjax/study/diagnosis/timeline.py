@@ -52,6 +52,7 @@ class Timeline(NamedTuple):
     rank: Int[np.ndarray, "T"]
     changes: tuple[TimedRankChange, ...]
     closest: tuple[float, float]  # time (s) and value of the minimum of `smallest` over all samples
+    unit: str = "s"  # of the times; that of the values along a `Kinematics` over the values of a driver
 
     @property
     def smallest(self) -> Float[np.ndarray, "T"]:
@@ -78,19 +79,23 @@ def timeline(mechanism: StudyModel, solution: StateHistory, rank_tol: float, tol
     if changes is not None and np.any(changes.are_released):
         names = ", ".join(quote(name) for name in changes.names[: changes.of_scene])
         raise ArgumentError(f"solution: its events release {names}: give a run that ends before, or leave it out")
-    analysis = analysis_of(mechanism)
-    ts, q, v = (np.asarray(x, float) for x in (solution.ts, solution.q, solution.v))
-    alive = np.isfinite(q).reshape(len(ts), -1).all(1)
-    ts, q, v = ts[alive], q[alive].reshape(alive.sum(), -1), v[alive].reshape(alive.sum(), -1)
+    analysis, unit = analysis_of(mechanism), getattr(solution, "unit", "s") or "s"
+    ts, q, v = (np.asarray(x, float) for x in (solution.ts, solution.q, getattr(solution, "slopes", solution.v)))
+    q, v = (x.reshape(len(ts), -1) for x in (q, v))
+    alive = np.flatnonzero(np.isfinite(q).all(1))
+    ts, order = np.unique(ts[alive], return_index=True)  # values of a driver may fall
+    q, v = q[alive][order], v[alive][order]
     tol = _tolerance(analysis, ts) if tol is None else tol
-    path = _Path(mechanism, analysis, ts, q, v, getattr(solution, "events", None) is None)
+    path = _Path(
+        mechanism, analysis, ts, q, v, getattr(solution, "events", None) is None and getattr(solution, "values_of", None) is None
+    )
     fine = np.unique(np.concatenate([np.linspace(a, b, SAMPLES_PER_OUTPUT + 1) for a, b in pairwise(ts)] or [ts]))
     sampled = path.singular_values(fine)
     output_indices = np.searchsorted(fine, ts)
     rank = np.sum(sampled > rank_tol * sampled[:, :1], axis=1)
     generic_rank = int(rank.max(initial=0))
     if not generic_rank:
-        return Timeline(ts, sampled[output_indices], rank[output_indices], (), (float(ts[0]), 1.0))
+        return Timeline(ts, sampled[output_indices], rank[output_indices], (), (float(ts[0]), 1.0), unit)
     sigma = sampled[:, generic_rank - 1] / sampled[:, 0]
     changes = []
     for k in _kinks(sigma):
@@ -99,7 +104,7 @@ def timeline(mechanism: StudyModel, solution: StateHistory, rank_tol: float, tol
         changes += [] if change is None else [change]
     k = int(np.argmin(sigma))
     least, when = min([(float(sigma[k]), float(fine[k])), *((c.smallest, c.time) for c in changes)])
-    return Timeline(ts, sampled[output_indices], rank[output_indices], tuple(changes), (when, least))
+    return Timeline(ts, sampled[output_indices], rank[output_indices], tuple(changes), (when, least), unit)
 
 
 def _tolerance(analysis: Analysis | None, ts: np.ndarray) -> float:
