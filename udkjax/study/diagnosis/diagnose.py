@@ -1,6 +1,6 @@
 """`diagnose`: mobility, redundancy, singularities and unique forces of a mechanism, and its rank along a trajectory."""
 
-from typing import Annotated, Any, overload
+from typing import Annotated, Any, cast, overload
 
 import numpy as np
 
@@ -79,8 +79,7 @@ def diagnose(
     if state is None and solution is not None:
         state, t = State(solution.q[0], solution.v[0]), float(times_of(solution)[0])
     if state is not None and isinstance(solution, Kinematics) and solution.values_of is not None:
-        assert isinstance(mechanism, Mechanism)
-        mechanism = with_halted_drivers(mechanism, t, state.q)
+        mechanism = with_halted_drivers(cast(Mechanism, mechanism), t, state.q)
     if isinstance(mechanism, ConstrainedSystem):
         return diagnose_system(mechanism, state, float(t), rank_tol, solution, time_tol)
     closure = close(mechanism, t, state)
