@@ -5,7 +5,6 @@ from udkjax.equations.friction.directed_friction import DirectedFriction as Dire
 from udkjax.equations.laws import udwadia_kalaba as udwadia_kalaba
 from udkjax.equations.laws.abstract_system import AbstractSystem as AbstractSystem
 from udkjax.equations.laws.abstract_system import TangentPart as TangentPart
-from udkjax.equations.laws.abstract_system import times_of as times_of
 from udkjax.equations.laws.formulations import Augmented as Augmented
 from udkjax.equations.laws.formulations import Formulation as Formulation
 from udkjax.equations.laws.formulations import NullSpaceQR as NullSpaceQR

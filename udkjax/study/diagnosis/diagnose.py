@@ -6,7 +6,6 @@ import numpy as np
 
 from udkjax.argument_types import HISTORY, NOT_NEGATIVE, POSITIVE
 from udkjax.equations import determinacy
-from udkjax.equations.laws.abstract_system import times_of
 from udkjax.equations.rows.analysis import hold_pins
 from udkjax.equations.rows.position_closure import is_closed
 from udkjax.equations.states.quantities import equations_of
@@ -77,9 +76,9 @@ def diagnose(
         ValueError: numbers of the mechanism are traced.
     """
     if state is None and solution is not None:
-        state, t = State(solution.q[0], solution.v[0]), float(times_of(solution)[0])
-    if state is not None and isinstance(solution, Kinematics) and solution.values_of is not None:
-        mechanism = with_halted_drivers(cast(Mechanism, mechanism), t, state.q)
+        state, t = State(solution.q[0], solution.v[0]), float(solution.ts[0])
+        if isinstance(solution, Kinematics) and solution.values_of is not None:  # not times
+            mechanism, t = with_halted_drivers(cast(Mechanism, mechanism), 0.0, state.q), 0.0
     if isinstance(mechanism, ConstrainedSystem):
         return diagnose_system(mechanism, state, float(t), rank_tol, solution, time_tol)
     closure = close(mechanism, t, state)
