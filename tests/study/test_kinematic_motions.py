@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import udkjax as udk
+from tests.choices import fast
 
 AMPLITUDE, FREQUENCY, PHASE, OFFSET = 0.4, 3.0, 0.3, 0.9
 TS = np.linspace(0.0, 0.9, 7)
@@ -66,9 +67,9 @@ def quantities(mech, motion):
     }
 
 
-@pytest.mark.parametrize("friction", FRICTION.values(), ids=FRICTION)
-def test_loads_along_values_are_those_of_the_motion(friction):
-    of_time, of_values = quantities(*in_time(friction)), quantities(*over_values(friction))
+@pytest.mark.parametrize("name", fast(["friction", "friction by load"], FRICTION))
+def test_loads_along_values_are_those_of_the_motion(name):
+    of_time, of_values = quantities(*in_time(FRICTION[name])), quantities(*over_values(FRICTION[name]))
     for name, expected in of_time.items():
         for a, b in zip(jax.tree.leaves(expected), jax.tree.leaves(of_values[name]), strict=True):
             np.testing.assert_allclose(b, a, rtol=1e-9, atol=1e-9, err_msg=name)
@@ -87,11 +88,11 @@ def test_a_uniform_motion_needs_no_compilation(monkeypatch):
 
 
 def test_efforts_along_values_have_derivatives():
-    mech, _ = over_values()
+    mech = two_motors()
 
     def effort(x):
-        motion = udk.kinematics(mech, "motor", VALUES + x[0], rate=RATES * x[1], acceleration=ACCELERATIONS + x[2])
-        return jnp.sum(udk.efforts(mech, motion)["motor"] * np.arange(1.0, 8.0))
+        motion = udk.kinematics(mech, "a", VALUES + x[0], rate=RATES * x[1], acceleration=ACCELERATIONS + x[2])
+        return jnp.sum(udk.efforts(mech, motion)["b"] * np.arange(1.0, 8.0))
 
     x = jnp.array([0.1, 1.2, 0.5])
     steps = 1e-5 * np.eye(3)
@@ -100,8 +101,8 @@ def test_efforts_along_values_have_derivatives():
     np.testing.assert_allclose(jax.jit(jax.vmap(effort))(x + steps), [effort(x + h) for h in steps], rtol=1e-10)
 
 
-def test_other_drivers_hold_still():
-    """Efforts are those of inverse dynamics, although in time the other motor turns, too."""
+def two_motors():
+    """Return two links in a chain, each turned by a motor of its own."""
     bodies = {"upper": udk.Body(1.0, 0.1, (0.5, 0.0)), "lower": udk.Body(1.0, 0.1, (1.5, 0.0))}
     joints = {
         "shoulder": udk.Revolute(("ground", "upper"), ((0.0, 0.0), (-0.5, 0.0))),
@@ -109,13 +110,18 @@ def test_other_drivers_hold_still():
     }
     drivers = {
         "a": udk.Driver(("ground", "upper"), "angle", udk.Polynomial([0.0, 1.0, 2.0])),
-        "b": udk.Driver(("upper", "lower"), "angle", udk.Sine(0.5, 2.0)),
+        "b": udk.Driver(("upper", "lower"), "angle", udk.Sine(0.5, 2.0, 0.6)),
     }
-    mech = udk.Mechanism(bodies, joints, drivers)
+    return udk.Mechanism(bodies, joints, drivers)
+
+
+def test_other_drivers_hold_still():
+    """Efforts are those of inverse dynamics, although in time the other motor turns, too."""
+    mech = two_motors()
     motion = udk.kinematics(mech, "a", VALUES, rate=RATES, acceleration=ACCELERATIONS, held={"b": 0.4})
     expected = udk.inverse_dynamics(mech, TS, motion).efforts
     found = udk.efforts(mech, motion, stabilization=udk.Baumgarte(5.0, 5.0))
-    for name in drivers:
+    for name in mech.drivers:
         np.testing.assert_allclose(found[name], expected[name], rtol=1e-10)
     np.testing.assert_allclose(udk.power_balance(mech, motion).drivers["b"], 0.0, atol=1e-12)
 

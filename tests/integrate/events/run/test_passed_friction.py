@@ -12,6 +12,7 @@ import pytest
 from jaxtyping import Array, Float
 
 import udkjax as udk
+from tests.choices import fast
 from tests.friction import rubbing
 from tests.integrate.events.run.passing import by_the_loop, counted
 from udkjax.native.module.layout import SHARE
@@ -57,10 +58,10 @@ CASES: dict[str, tuple[udk.Mechanism, dict[str, Any], int]] = {
     "events": (CHAIN, {"events": [TURNS, WALL]}, 5),
     "few outputs": (CHAIN, {"ts": [0.0, 2.0]}, 1),
 }
-QUICK = ("chain", "four-bar", "jumping forces")
+QUICK = ("four-bar",)  # in the others machine code passes ten times as many events, each by the loop as well
 
 
-@pytest.mark.parametrize("case", [x if x in QUICK else pytest.param(x, marks=pytest.mark.slow) for x in CASES])
+@pytest.mark.parametrize("case", fast(QUICK, CASES))
 def test_machine_code_passes_events_as_the_loop_does(case, monkeypatch):
     mechanism, options, most_calls = CASES[case]
     options = {"ts": TS, "rtol": 1e-10, "atol": 1e-10} | options

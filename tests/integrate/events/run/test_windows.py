@@ -13,6 +13,7 @@ import pytest
 import udkjax as udk
 from experiments.parts.random_scenes import build, random_scene, state_of
 from tests.calls import Call, calls_of
+from tests.choices import fast
 from tests.integrate.events.instant.test_sticking import Bumper, belt, block, oscillator, sticking
 from tests.integrate.motions.test_redundant_friction import doubled
 from udkjax.integrate.events.run.host_run import PlainForm
@@ -104,7 +105,7 @@ SCENES = {
 }
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("name", fast(["block", "four-bar", "bounces"], SCENES))
 def test_runs_by_windows_are_those_between_crossings(name, windows, from_the_start):
     (mechanism, more), ts = SCENES[name](), np.linspace(0.0, 2.0, 41)
     expected = udk.simulate(mechanism, ts, **TOL, **more)
