@@ -209,9 +209,11 @@ def test_derivatives_at_toggles():
     check_derivatives(least, np.array([0.2, 0.09]), 1e-4)
 
 
-def test_derivatives_along_a_run():
+@pytest.mark.parametrize(("drive", "values"), [(None, np.linspace(0, 2 * np.pi, 41)), ("motor", np.linspace(2 * np.pi, 0, 41))])
+def test_derivatives_along_a_run(drive, values):
+    """Values of a driver may fall."""
     mech = four_bar()
-    run = udk.kinematics(mech, None, np.linspace(0, 2 * np.pi, 41))
+    run = udk.kinematics(mech, drive, values)
 
     def least(x):  # the run need not be a motion of the mechanism
         moved = eqx.tree_at(lambda r: r.q, run, run.q.at[:, 2, 0].add(x[0] * np.arange(41.0)).at[:, 0, 2].multiply(1 + x[1]))
@@ -224,8 +226,9 @@ def test_a_run_and_a_drive_agree():
     mech = four_bar()
     run = udk.simulate(mech, np.linspace(0, 2 * np.pi, 400))
     motion = udk.kinematics(mech, "motor", np.linspace(0, 2 * np.pi, 400), rate=3.0)
+    back = udk.kinematics(mech, "motor", np.linspace(2 * np.pi, 0, 400), rate=3.0)
     wanted = udk.gaps(mech).least
-    for given in (run, motion):
+    for given in (run, motion, back):
         found = udk.gaps(mech, run=given).least
         assert found.distance == pytest.approx(wanted.distance, abs=1e-9)
 

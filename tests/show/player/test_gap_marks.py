@@ -86,9 +86,16 @@ def test_gaps_of_several_runs_are_given_by_label(wide):
     assert shown.data["runs"][1]["gaps"]["words"] == "least gap of crank and rocker: 20 mm"
 
 
+def test_gaps_over_values_of_a_driver_are_shown(wide):
+    mech, _ = wide
+    motion = udk.kinematics(mech, "motor", np.linspace(1.2, 0.2, 11), rate=-2.0)
+    found, (record,) = udk.gaps(mech, run=motion), udk.animate(mech, motion, gaps=True).data["runs"]
+    assert record["gaps"]["t"] == found.least.value and 0.2 <= found.least.value <= 1.2
+
+
 def test_wrong_gaps_are_refused_by_name(wide, tmp_path, capsys):
     mech, run = wide
-    with pytest.raises(ValueError, match=r"over values in rad: give udk.gaps\(mechanism, run=solution\)"):
+    with pytest.raises(ValueError, match=r"over values in rad and time: give udk.gaps\(mechanism, run=solution\)"):
         udk.animate(mech, run, gaps=udk.gaps(mech))
     with pytest.raises(ValueError, match="leave out gaps or live"):
         udk.animate(mech, run, gaps=True, live=True)

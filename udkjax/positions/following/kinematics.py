@@ -12,7 +12,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from udkjax.annotations import NumberLike, Numbers
 from udkjax.argument_types import FINITE, NUMBERS_BY_NAME
-from udkjax.arrays import is_traced, library_for, make_module, number, stored
+from udkjax.arrays import is_traced, library_for, make_module, number, stored, without_derivatives
 from udkjax.equations.rows.analysis import Analysis, analyse
 from udkjax.positions.assembling.assembly import State, assemble, close
 from udkjax.positions.assembling.coordinates import element_of
@@ -96,6 +96,14 @@ class Kinematics(PrintsTable):
     def slopes(self) -> Float[Array, "T bodies 3"]:
         """The derivatives of q by the values (m, m, rad per unit of the values); NaN where `rate` is zero."""
         return stored(self.v / self.rate[..., None, None])
+
+    def in_order(self) -> "Kinematics":
+        """Return the motion with its values, which are concrete, in rising order, each once."""
+        order = np.unique(np.asarray(without_derivatives(self.values)), return_index=True)[1]
+        if np.array_equal(order, np.arange(len(self.values))):
+            return self
+        states = "values", "q", "v", "a", "rate", "acceleration", "status"
+        return make_module(Kinematics, **vars(self) | {name: getattr(self, name)[order] for name in states})
 
     def frame(self, body: str) -> Frame:
         """Return the frame of a body, each of its numbers (T,)."""

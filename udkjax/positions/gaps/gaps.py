@@ -13,6 +13,7 @@ from udkjax.arrays import is_traced, without_derivatives
 from udkjax.positions.answers.counting import Count
 from udkjax.positions.assembling.channels import StateHistory
 from udkjax.positions.following.drive import Drive, only_driver
+from udkjax.positions.following.kinematics import Kinematics
 from udkjax.positions.gaps.derivatives import differentiable_gaps
 from udkjax.positions.gaps.motion import motion_of_drive, motion_of_run
 from udkjax.positions.gaps.pairs import LinkPair, pairs_to_check
@@ -192,6 +193,8 @@ def gaps(
     if run is not None and not (drive is None and values is None and held is None):
         raise ArgumentError("run is given with drive, values or held: leave out either")
     driver = None if run is not None else only_driver(mechanism) if drive is None else drive
+    if isinstance(run, Kinematics) and not is_traced(without_derivatives(run)):
+        run = run.in_order()
     given = (mechanism, driver, values, run, shapes, held)
     now = without_derivatives(given)
     if is_traced(now):

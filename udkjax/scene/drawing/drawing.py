@@ -335,6 +335,9 @@ def _entries(section: str, group: Mapping[str, Any] | Sequence[Any] | None) -> l
         elif isinstance(item, Mapping) and section in DRAWN:
             entries.append(SceneEntry(section, k, name, cls, item))
         else:
-            problem = f"{where(section, k, name)}: must be a table or of class {cls.__name__}, not a {type(item).__name__}"
+            kinds = "a table or of class" if section in DRAWN else "of class"
+            problem = f"{where(section, k, name)}: must be {kinds} {cls.__name__}, not a {type(item).__name__}"
+            if section == "driver" and isinstance(item, Mapping):
+                problem += "; tables of motors belong to `motors`"
             entries.append(SceneEntry(section, k, name, None, {}, problem))
     return entries

@@ -29,8 +29,10 @@ def add_gaps(record: JsonObject, mechanism: Mechanism, run: ShownMotion, found: 
         if not found:
             return
         found = gaps(mechanism, run=run)
-    if found.unit != "s":
-        raise ValueError(f"gaps: must be over time, not over values in {found.unit}: give udk.gaps(mechanism, run=solution)")
+    over = getattr(run, "unit", "s") or "s"
+    if found.unit != over:
+        which = " and ".join("time" if unit == "s" else f"values in {unit}" for unit in (found.unit, over))
+        raise ValueError(f"gaps and run are over {which}: give udk.gaps(mechanism, run=solution)")
     least = {"t": found.least.value, "least": float(found.least.distance), "words": found.summary()}
     record["gaps"] = least | outlines(found, mechanism.body_names)
     events = [{"t": least["t"], "name": least["words"]}]

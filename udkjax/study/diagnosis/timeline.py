@@ -22,6 +22,7 @@ from udkjax.integrate.solution import Solution
 from udkjax.pinv import SVD
 from udkjax.positions.assembling.assembly import State
 from udkjax.positions.assembling.channels import StateHistory
+from udkjax.positions.following.kinematics import Kinematics
 from udkjax.programs.deferred import deferred
 from udkjax.requirements import ArgumentError
 from udkjax.study.quantities import StudyModel
@@ -79,12 +80,11 @@ def timeline(mechanism: StudyModel, solution: StateHistory, rank_tol: float, tol
     if changes is not None and np.any(changes.are_released):
         names = ", ".join(quote(name) for name in changes.names[: changes.of_scene])
         raise ArgumentError(f"solution: its events release {names}: give a run that ends before, or leave it out")
+    solution = solution.in_order() if isinstance(solution, Kinematics) else solution
     analysis, unit = analysis_of(mechanism), getattr(solution, "unit", "s") or "s"
     ts, q, v = (np.asarray(x, float) for x in (solution.ts, solution.q, getattr(solution, "slopes", solution.v)))
-    q, v = (x.reshape(len(ts), -1) for x in (q, v))
-    alive = np.flatnonzero(np.isfinite(q).all(1))
-    ts, order = np.unique(ts[alive], return_index=True)  # values of a driver may fall
-    q, v = q[alive][order], v[alive][order]
+    alive = np.isfinite(q).reshape(len(ts), -1).all(1)
+    ts, q, v = ts[alive], q[alive].reshape(alive.sum(), -1), v[alive].reshape(alive.sum(), -1)
     tol = _tolerance(analysis, ts) if tol is None else tol
     path = _Path(
         mechanism, analysis, ts, q, v, getattr(solution, "events", None) is None and getattr(solution, "values_of", None) is None
