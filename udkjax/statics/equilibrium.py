@@ -224,7 +224,7 @@ def _rest_curve(mechanism: Mechanism, analysis: Analysis, by: ControlFlow) -> Ab
 def _omega2(at: Linearization, by: ControlFlow) -> Float[Array, "f"]:
     """Return omega^2 of the undamped linearization, (rad/s)^2, ascending."""
     xp, K = by.xp, with_unit_mass(at, by)[1]
-    return xp.linalg.eigvalsh(0.5 * (K + K.T)) if len(K) else xp.zeros(0)
+    return xp.linalg.eigvalsh(0.5 * (K + K.T)) if len(K) > 1 else K.ravel()
 
 
 def _equilibrium(
@@ -238,8 +238,8 @@ def _equilibrium(
         assert isinstance(curve, Curve)
         (q,) = whole(_rest_position(curve, analysis, t, q, free))
     xp, scale, at = by.xp, near.scale(t, q), near.linearize(t, q)
-    unbalanced = xp.linalg.norm(at.force) / xp.where(scale.force > 0, scale.force, 1.0)
-    balanced = curve.is_closed(xp.append(q, t) / curve.units) & (unbalanced <= FORCE_TOL)
+    unbalanced = _length(at.force, xp) / xp.where(scale.force > 0, scale.force, 1.0)
+    balanced = curve.is_closed(xp.concatenate([q, xp.reshape(xp.asarray(t), 1)]) / curve.units) & (unbalanced <= FORCE_TOL)
     neutral, friction = SMALLEST_STIFFNESS * scale.stiffness, Friction.names_in(mechanism.forces)
     holds_around = balanced & friction_holds_around(mechanism, analysis, t, q, free) if friction else balanced & False
     return make_module(
@@ -266,7 +266,7 @@ def _settle(
     if not free:
         return q
     by, xp, scale = curve.by, curve.by.xp, near.scale(t, q)
-    units = _step_units(curve.units[:-1], q, xp)
+    units, value = _step_units(curve.units[:-1], q, xp), xp.reshape(xp.asarray(t), 1)
 
     def is_unsettled(state: Settling) -> IsTrue:
         _, current, k, better, _ = state
@@ -281,7 +281,7 @@ def _settle(
 
         def trial(state: Trial) -> Trial:
             share, j, *_ = state
-            X, closed = curve.correct(xp.append(q + share * step, t) / curve.units, fixed=True)
+            X, closed = curve.correct(xp.concatenate([q + share * step, value]) / curve.units, fixed=True)
             new = (X * curve.units)[:-1]
             trial = near.linearize(t, new)
             # A position is better if the loads do work (by the trapezoidal rule), or the unbalanced loads decrease.
@@ -312,7 +312,7 @@ def _step_units(units: Float[Array, "n"], q: Float[Array, "n"], xp: ArrayLibrary
     A body at the end of a long chain moves by many lengths of a link while all links turn by a small angle.
     """
     places = q.reshape(-1, 3)[:, :2]
-    extent = xp.max(xp.max(places, axis=0) - xp.min(places, axis=0))
+    extent = (places.max(0) - places.min(0)).max()
     lengths, angles = units.reshape(-1, 3)[:, :2], units.reshape(-1, 3)[:, 2:]
     return xp.concatenate([xp.maximum(lengths, extent), angles], axis=1).ravel()
 
@@ -320,8 +320,12 @@ def _step_units(units: Float[Array, "n"], q: Float[Array, "n"], xp: ArrayLibrary
 def _towards_rest(linearization: Linearization, scale: LoadScale, stable: bool, curve: AbstractCurve) -> Float[Array, "f"]:
     """Return the step eta of the linearization; only downhill if the equilibrium is to be stable."""
     xp, rounding = curve.by.xp, SMALLEST_STIFFNESS * scale.stiffness
+    if xp is np and len(linearization.force) == 1:  # in a fifth of the time of decompositions
+        stiffness = linearization.stiffness[0, 0]
+        least = max(abs(stiffness), rounding) if stable else stiffness if abs(stiffness) > rounding else np.inf
+        return linearization.force / (least if least else 1.0)
     if not stable:
-        resists = xp.max(xp.abs(linearization.stiffness)) > rounding
+        resists = abs(linearization.stiffness).max() > rounding
         return curve.plus(xp.where(resists, linearization.stiffness, 0.0), NEUTRAL_STIFFNESS) @ linearization.force
     values, vectors = xp.linalg.eigh(0.5 * (linearization.stiffness + linearization.stiffness.T))
     values = xp.abs(values)

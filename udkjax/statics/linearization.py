@@ -9,6 +9,7 @@ The second term of K, the constraints' curvature under load, turns a pendulum's 
 constraints lambda has the least norm; N^T K N does not depend on that choice.
 """
 
+import math
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
@@ -23,11 +24,14 @@ from udkjax.equations import udwadia_kalaba as uk
 from udkjax.equations.elimination.dense_pseudoinverse import dense_pseudoinverse
 from udkjax.equations.rows.analysis import Analysis
 from udkjax.equations.rows.dense_rows import DenseTerms
+from udkjax.equations.terms.rest_program import REDUCED
 from udkjax.pinv import SVD
 from udkjax.programs.control_flow import BY_JAX, ControlFlow
 from udkjax.programs.identity_cache import cached_by_identity
 from udkjax.scene.mechanism import Mechanism
 from udkjax.statics.load_scale import LoadScale, load_scale, scale_of
+
+CLEARLY_ALONG = 0.1  # least part of a unit vector along the constraints that determines their direction, but for one digit
 
 
 class Linearization(NamedTuple):
@@ -90,6 +94,9 @@ class NumpyLinearizer:
         self._root = 1 / np.sqrt(self._terms.mass)
         self._factors = self._weights[:, None] * self._root
         self._latest: tuple[Any, Any] = None, None  # the last state and its linearization
+        # In one direction, by elimination, with a vector whose tangent part that is.
+        has_one = free == 1 and self._terms.count > 0 and analysis.redundant_rows == ()
+        self._eliminated, self._direction = self._terms.eliminated((), None) if has_one else None, None
 
     def linearize(self, t: Any, q: Any) -> Any:
         """Return the linearization at rest in a closed position q at time t (s); the last one is cached."""
@@ -99,6 +106,8 @@ class NumpyLinearizer:
         return latest[1]
 
     def _linearize(self, t: Any, q: Any) -> Linearization:
+        if self._direction is not None and (eliminated := self._eliminate(t, q)) is not None:
+            return eliminated
         terms, root, w = self._terms, self._root, self._weights
         at_rest = terms.loads_at_rest(t, q)
         if terms.count:
@@ -113,7 +122,19 @@ class NumpyLinearizer:
         NT = N.T
         reduced = NT @ (terms.mass[:, None] * N), NT @ at_rest.damping @ N, NT @ K @ N, NT @ at_rest.force
         found: tuple[Any, ...] = N, *reduced, at_rest.force, multipliers
+        if self._eliminated is not None and self._direction is None:
+            self._direction = N[:, 0]
         return Linearization._make(found)
+
+    def _eliminate(self, t: Any, q: Any) -> Linearization | None:
+        """Return the linearization in one direction; None if that needs singular values."""
+        found = self._eliminated and self._eliminated.linearization(float(t), q, self._direction)
+        if not found or not (square := found[REDUCED][0]) > CLEARLY_ALONG**2:
+            return None
+        N, force = found["dq1"] / math.sqrt(square), self._terms.mass * found["dv"]
+        _, stiffness, damping = found[REDUCED] / square
+        reduced: tuple[Any, ...] = np.ones((1, 1)), damping.reshape(1, 1), stiffness.reshape(1, 1), np.array([N @ force])
+        return Linearization(N[:, None], *reduced, force, -found["multipliers"])
 
     def scale(self, t: Any, q: Any) -> LoadScale:
         """Return the scales of forces and stiffnesses at rest."""
@@ -154,6 +175,8 @@ def with_unit_mass(at: Linearization, by: ControlFlow) -> tuple[Array, Array]:
     """Return damping and stiffness in directions N L^(-T) in which the mass matrix L L^T is the unit matrix."""
     if not len(at.mass):
         return at.damping, at.stiffness
+    if len(at.mass) == 1:
+        return at.damping / at.mass, at.stiffness / at.mass
     solve = solver_of_mass(at, by)
     damping, stiffness = (solve(solve(A).T).T for A in (at.damping, at.stiffness))
     return damping, stiffness

@@ -37,6 +37,7 @@ OUTPUTS = {
     "v1": "v after a Newton step to Psi_dot = 0 and phi = 0",
     "dq1": "the tangent part of the change dq",
     "dv1": "the tangent part of the change dv",
+    "balance": "a_F as `dv`, its tangent part as `dv1`, and the negative `multipliers` lambda of F = M dv1 + Psi_q^T lambda",
     "safe": "one if all pivots exceed `safe_tol`, or the policy does not check them",
     "distance": "the root of the smallest pivot relative to its diagonal entry: the distance from dependence",
     "independent": "one for each row that is retained, zero for dependent rows",

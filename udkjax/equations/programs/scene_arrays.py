@@ -9,11 +9,13 @@ import numpy as np
 from udkjax.annotations import AnyArray, Time
 from udkjax.arrays import ArrayLibrary
 from udkjax.equations.programs.scene_programs import ScenePrograms, scene_programs
-from udkjax.equations.terms.rest_program import CURVATURE, OF_LOADS
+from udkjax.equations.terms.rest_program import CURVATURE, OF_LOADS, REDUCED
 from udkjax.equations.terms.structure import concrete_numbers
 from udkjax.expressions.loops.array_loops import ArrayLoops
 from udkjax.programs.identity_cache import cached_by_identity
 from udkjax.scene.mechanism import Mechanism
+
+LINEARIZATION = "dq1", "dv", "dv1", "multipliers", "distance", REDUCED
 
 
 class SceneArrays(Generic[AnyArray]):
@@ -77,6 +79,14 @@ class SceneArrays(Generic[AnyArray]):
         """Return the entries of (lambda^T Psi)_qq, as `RestProgram.places` orders them."""
         found = self._run((CURVATURE,), t, q, q, multipliers=multipliers)
         return found[CURVATURE] if CURVATURE in found else self._xp.zeros(0)
+
+    def linearization(self, t: Time, q: AnyArray, direction: AnyArray) -> dict[str, AnyArray] | None:
+        """Return arrays of the linearization at rest in one direction, the tangent part of the given one, by elimination.
+
+        `RestProgram.reduction` and the output "balance" explain those of `LINEARIZATION`. None if neither machine code nor
+        floats of Python are possible.
+        """
+        return self._run_at_state(LINEARIZATION, t, q, self._xp.zeros_like(q), {"dq": direction}, often=True)
 
     def newton_step(self, t: Time, q: AnyArray) -> tuple[AnyArray, AnyArray, float] | None:
         """Return q (n,) after a Newton step to Psi = 0 by elimination, Psi (m,) at q, and the distance from dependent rows.
@@ -160,10 +170,12 @@ class _Evaluator(NamedTuple):
 @cached_by_identity
 def _evaluator(programs: ScenePrograms, xp: ArrayLibrary, *outputs: str) -> _Evaluator:
     """Return the program of some outputs as a function of its arrays."""
-    p, at_rest = programs, programs.at_rest.sizes if outputs[0] in (*OF_LOADS, CURVATURE) else {}
-    program = p.at_rest.of(*outputs) if at_rest else p.of(*outputs)
-    sizes = p.scratch | {"psi": p.row_count, "psi_dot": p.row_count, "terms": p.term_count, "energy": 2} | at_rest
-    sizes |= {"q1": p.coordinate_count, "distance": 1}
+    p, n, m = programs, programs.coordinate_count, programs.row_count
+    at_rest = p.at_rest.sizes if outputs[0] in (*OF_LOADS, CURVATURE) or outputs == LINEARIZATION else {}
+    program = p.linearization if outputs == LINEARIZATION else p.at_rest.of(*outputs) if at_rest else p.of(*outputs)
+    sizes = p.scratch | {"psi": m, "psi_dot": m, "multipliers": m, "terms": p.term_count, "energy": 2} | at_rest
+    sizes |= dict.fromkeys(("q1", "dq1", "dv", "dv1"), n) | {"distance": 1, REDUCED: 3}
     results = tuple(x for x in outputs if not at_rest or x in program.written)
-    blank = {x: size for x, size in sizes.items() if x in program.arrays | set(results)}
+    given = {"multipliers"} if outputs == (CURVATURE,) else set()
+    blank = {x: size for x, size in sizes.items() if x in (program.arrays | set(results)) - given}
     return _Evaluator(ArrayLoops(program, xp, results or None), blank, results)

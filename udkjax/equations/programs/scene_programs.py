@@ -190,6 +190,12 @@ class ScenePrograms(RunPrograms):
         return write_rest_program(self._terms)
 
     @cached_property
+    def linearization(self) -> LoopProgram:
+        """The program of a linearization at rest in one direction, the tangent part of `dq`: see `RestProgram.reduction`."""
+        parts = self.of("dq1", "distance", "balance").parts
+        return LoopProgram([*parts, *self.at_rest.loads.parts, *self.at_rest.curvature.parts, *self.at_rest.reduction.parts])
+
+    @cached_property
     def differentiable(self) -> DifferentiablePrograms:
         """The programs that are differentiated."""
         return DifferentiablePrograms(self._solver)

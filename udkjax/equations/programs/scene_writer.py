@@ -103,6 +103,7 @@ class SceneWriter:
             **dict.fromkeys(("a refined", "q1 refined", "v1 refined"), (("all refined",), tuple)),
             "dq1": (("factors",), lambda: self._tangent_part("dq")),
             "dv1": (("factors",), lambda: self._tangent_part("dv")),
+            "balance": (("free", "factors"), self._balance),
             "dq1 by value": (("factors",), lambda: [*solver.solve(0), terms.add("dq1", solution=0, sign=-1)]),
             "dv1 by value": (("dq1 by value",), self._second_derivative),
         }
@@ -173,6 +174,14 @@ class SceneWriter:
         solve = self._next_solve()
         yield from self._terms.rates(change, solve, of_positions=change == "dq")
         yield from self._correct(change, solve)
+
+    def _balance(self) -> ProgramParts:
+        """Compute the tangent part of a_F, and the multipliers of the rest of the loads."""
+        solve = self._next_solve()
+        yield self._terms.add("dv", start="free")
+        yield from self._terms.rates("dv", solve)
+        yield from self._correct("dv", solve)
+        yield from self._terms.multipliers(solve)
 
     def _second_derivative(self) -> ProgramParts:
         solve = self._next_solve()

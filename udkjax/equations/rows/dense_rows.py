@@ -11,7 +11,7 @@ import numpy as np
 from udkjax.annotations import Time
 from udkjax.arrays import ROUNDING
 from udkjax.equations.elimination.dense_pseudoinverse import FactoredPseudoinverse, TruncatedPseudoinverse, dense_pseudoinverse
-from udkjax.equations.programs.eliminated_steps import EliminatedSteps
+from udkjax.equations.programs.eliminated_steps import Eliminated
 from udkjax.equations.programs.scales import Scales, concrete_scales
 from udkjax.equations.programs.scene_arrays import arrays_in_time
 from udkjax.equations.programs.scene_programs import scene_programs
@@ -90,9 +90,9 @@ class DenseTerms(RowTerms):
         """Return the terms of a mechanism, made once for each mechanism."""
         return DenseTerms(mechanism)
 
-    def eliminated_steps(self, redundant_rows: tuple[int, ...], length: float) -> EliminatedSteps | None:
-        """Return Newton steps to Psi = 0, the smallest with `length` (m) as a unit; None if numbers are sampled over time."""
-        return None if self._is_sampled else EliminatedSteps(self._kind, self._arrays_at(0.0).numbers, redundant_rows, length)
+    def eliminated(self, redundant_rows: tuple[int, ...], length: float | None) -> Eliminated | None:
+        """Return programs of elimination, as `Eliminated` explains; None if numbers are sampled over time."""
+        return None if self._is_sampled else Eliminated(self._kind, self._arrays_at(0.0).numbers, redundant_rows, length)
 
     def slopes(self, t: Time, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return Psi_q (m, n) and Psi_t (m,)."""
@@ -233,12 +233,12 @@ class KinematicRows(DenseRows, PositionRows[DensePosition]):
         if self.balance is not None:
             self.metric, self.weights = self.metric * self.balance.coordinates, self.weights / self.balance.rows
         self.driver_time_step = driver_time_step(self.scales)
-        self._steps: EliminatedSteps | None = None
+        self._eliminated: Eliminated | None = None
 
     def leave_out(self, redundant_rows: tuple[int, ...]) -> None:
         """Eliminate coordinates in corrections where all other rows are clearly independent; the steps are the same."""
         if self.balance is None:
-            self._steps = self.eliminated_steps(redundant_rows, float(self.scales.arm))
+            self._eliminated = self.eliminated(redundant_rows, float(self.scales.arm))
 
     def residual(self, t: Time, q: np.ndarray) -> np.ndarray:
         return super().residual(t, q) if self.balance is None else super().residual(t, q) / self.balance.rows
@@ -247,7 +247,7 @@ class KinematicRows(DenseRows, PositionRows[DensePosition]):
         return super().step_size(step if self.balance is None else step / self.balance.coordinates)
 
     def correction(self, t: Time, q: np.ndarray) -> np.ndarray:
-        found = self._steps and self._steps(np.asarray(t, float).item(), q)
+        found = self._eliminated and self._eliminated.newton_step(np.asarray(t, float).item(), q)
         return super().correction(t, q) if not found else found[0] - q
 
     def at(self, t: Time, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

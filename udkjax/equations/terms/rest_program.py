@@ -12,10 +12,12 @@ from typing import NamedTuple
 import numpy as np
 
 from udkjax.equations.terms.scene_layout import BODIES, BODY_COORDINATES, ROW, ConstraintGroup, ElementGroup
-from udkjax.equations.terms.scene_terms import ProgramParts, SceneTerms
+from udkjax.equations.terms.scene_terms import ProgramParts, SceneTerms, compliance
 from udkjax.expressions import KernelWriter, LoopProgram, Scalar, tangents
+from udkjax.expressions.loops.loop_program import ADD, KernelLoop, Reset
 
 LOADS, STIFFNESS, DAMPING, CURVATURE = "loads_at_rest", "stiffness", "damping", "curvature"
+REDUCED = "reduced"  # u^T M u, u^T K u and u^T C u
 OF_LOADS = LOADS, STIFFNESS, DAMPING
 
 
@@ -30,11 +32,13 @@ class RestProgram(NamedTuple):
     """Programs of a scene at rest.
 
     `loads` computes the loads of force elements, from t, q and v, and their negative derivatives by q and v; `curvature` the
-    second derivatives of lambda^T Psi, from the array `multipliers` of all rows.
+    second derivatives of lambda^T Psi, from the array `multipliers` of all rows. `reduction` computes u^T M u, u^T K u and
+    u^T C u of the array u = `dq1` from these, with the negative multipliers.
     """
 
     loads: LoopProgram
     curvature: LoopProgram
+    reduction: LoopProgram
     places: dict[str, EntryPlaces]  # of the entries in each array
 
     def of(self, *outputs: str) -> LoopProgram:
@@ -72,7 +76,9 @@ def write_rest_program(terms: SceneTerms) -> RestProgram:
     entries = {name: _Entries() for name in (LOADS, STIFFNESS, DAMPING, CURVATURE)}
     loads = [*([terms.sincos()] if terms.layout.forces else []), *_write_loads(terms, entries)]
     curvature = [terms.sincos(), *_write_curvature(terms, entries[CURVATURE])]
-    return RestProgram(LoopProgram(loads), LoopProgram(curvature), {name: x.places() for name, x in entries.items()})
+    places = {name: x.places() for name, x in entries.items()}
+    reduction = LoopProgram(list(_write_reduction(terms, places)))
+    return RestProgram(LoopProgram(loads), LoopProgram(curvature), reduction, places)
 
 
 def _write_loads(terms: SceneTerms, entries: dict[str, _Entries]) -> ProgramParts:
@@ -114,6 +120,26 @@ def _write_curvature(terms: SceneTerms, entries: _Entries) -> ProgramParts:
         if block:
             loop = terms.over_group(CURVATURE, group, write)
             yield loop._replace(table=np.column_stack([group.table, start]))
+
+
+def _write_reduction(terms: SceneTerms, places: dict[str, EntryPlaces]) -> ProgramParts:
+    yield Reset(REDUCED, 0, 3)
+
+    def add_mass(w: KernelWriter):
+        for k in range(3):
+            u = w.read("dq1", BODY_COORDINATES, k)
+            w.write(u * u / compliance(w, k), REDUCED, None, 0, ADD)
+
+    yield terms.over_bodies(("reduced", "mass"), add_mass)
+    for name, place, sign in ((STIFFNESS, 1, 1.0), (CURVATURE, 1, -1.0), (DAMPING, 2, 1.0)):
+
+        def add(w: KernelWriter, name: str = name, place: int = place, sign: float = sign):
+            entry = w.read(name, 0) * w.graph.constant(sign)
+            w.write(entry * w.read("dq1", 1) * w.read("dq1", 2), REDUCED, None, place, ADD)
+
+        rows, columns = places[name]
+        if len(rows):
+            yield KernelLoop(terms.kernel(("reduced", name), add), np.stack([np.arange(len(rows)), rows, columns], 1))
 
 
 def _derivatives(outputs: Sequence[Scalar], variables: Iterable[Scalar]) -> dict[tuple[int, int], Scalar]:

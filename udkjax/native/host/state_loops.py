@@ -36,8 +36,9 @@ class StateLoops:
     """
 
     def __init__(self, program: LoopProgram, sizes: Mapping[str, int], results: Sequence[str]):
-        ends = [0, *accumulate(sizes.values())]
-        places = dict(zip(sizes, ends, strict=False))
+        lengths = {**{name: sizes[name] for name in results}, **sizes}  # the results come first, to be copied together
+        ends = [0, *accumulate(lengths.values())]
+        places = dict(zip(lengths, ends, strict=False))
         loops = LoopWriter(1)
         at = {name: ("work", place) for name, place in places.items()} | {"constants": ("constants", 0)}
         loops.write(program, "evaluate", ("constants", "work"), at)
@@ -47,7 +48,8 @@ class StateLoops:
         self._work, self._lock = np.zeros(max(ends[-1], 1)), Lock()
         self._address = self._work.__array_interface__["data"][0]
         self._views = {name: self._work[place : place + sizes[name]] for name, place in places.items()}
-        self._results = [(name, self._views[name]) for name in results]
+        self._found = self._work[: ends[len(results)]]
+        self._results = [(name, slice(*ends[k : k + 2])) for k, name in enumerate(results)]
 
     def __call__(self, constants: int, given: Mapping[str, np.ndarray | float]) -> dict[str, np.ndarray]:
         """Return the results for the address of the constants, in float64, and arrays by name."""
@@ -56,7 +58,8 @@ class StateLoops:
             for name, x in given.items():
                 views[name][...] = x
             self._run(constants, self._address)
-            return {name: view.copy() for name, view in self._results}
+            found = self._found.copy()
+        return {name: found[place] for name, place in self._results}
 
 
 class LoopsAtMany:

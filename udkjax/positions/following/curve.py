@@ -1,7 +1,6 @@
 """Positions of a driven mechanism as a curve Psi(s, q) = 0 in scaled coordinates and value, X = (q, s)."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, ClassVar
@@ -14,6 +13,7 @@ from jaxtyping import Array, Bool, Float
 from udkjax.arrays import library_for, number
 from udkjax.equations import constraints
 from udkjax.equations.elimination.dense_pseudoinverse import dense_pseudoinverse
+from udkjax.equations.programs.eliminated_steps import Eliminated
 from udkjax.equations.rows.analysis import Analysis
 from udkjax.equations.rows.dense_rows import DenseTerms
 from udkjax.equations.rows.position_closure import CLOSURE
@@ -25,6 +25,9 @@ from udkjax.programs.control_flow import BY_JAX, BY_NUMPY, ControlFlow
 from udkjax.programs.identity_cache import cached_by_identity
 from udkjax.scene.mechanism import Mechanism
 
+_ROUNDING = CLOSURE.rounding * float(np.finfo(float).eps)
+# Violation up to which a step by elimination, far from dependent rows, is the last: it leaves one of the order of the square.
+ALMOST_CLOSED = 1e-9
 NEWTON_STEPS = 8  # largest number; three are usual
 _Correction = tuple[Any, Any, Any]  # X, corrections so far, whether it is closed
 
@@ -181,7 +184,7 @@ class NumpyCurve(AbstractCurve):
     units: Float[np.ndarray, "n+1"]
     rows: Float[np.ndarray, "m"]
     independent: tuple[int, ...]
-    steps: Callable[[float, np.ndarray], tuple[np.ndarray, np.ndarray] | None] | None  # `DenseTerms.eliminated_steps`
+    eliminated: Eliminated | None  # `DenseTerms.eliminated`
 
     by: ClassVar[ControlFlow] = BY_NUMPY
 
@@ -195,8 +198,8 @@ class NumpyCurve(AbstractCurve):
         scales = jax.tree.map(np.asarray, analysis.scales)
         units = np.append(np.tile([scales.length, scales.length, 1.0], analysis.coordinates // 3), unit)
         terms = DenseTerms.of(mechanism)
-        steps = terms.eliminated_steps(analysis.redundant_rows or (), float(scales.length))
-        return cls(terms, scales.weights, units, scales.rows, analysis.independent_rows, steps)
+        eliminated = terms.eliminated(analysis.redundant_rows or (), float(scales.length))
+        return cls(terms, scales.weights, units, scales.rows, analysis.independent_rows, eliminated)
 
     @cached_property
     def _factors(self) -> Float[np.ndarray, "m n+1"]:
@@ -217,6 +220,9 @@ class NumpyCurve(AbstractCurve):
 
     def residual(self, X: Any) -> Any:
         return self.weights * self._geometry(X)[0]
+
+    def rounding(self, X: Any) -> Any:
+        return _ROUNDING * max(1.0, np.abs(X).max())
 
     def violation(self, X: Any) -> Any:
         return np.abs(self._geometry(X)[0] / self.rows).max(initial=0.0)
@@ -259,14 +265,14 @@ class NumpyCurve(AbstractCurve):
     def _eliminate(self, X: Any) -> np.ndarray | None:
         """Return the nearest point of the curve with the same value, by elimination; None if that is not possible."""
         x = X * self.units
-        q, s, rounding = x[:-1], float(x[-1]), self.rounding(X)
+        q, s = x[:-1], float(x[-1])
         for _ in range(NEWTON_STEPS):
-            found = self.steps and self.steps(s, q)
+            found = self.eliminated and self.eliminated.newton_step(s, q)
             if not found:
                 return None
             q, psi = found
-            if np.abs(psi / self.rows).max() <= rounding:
-                return np.append(q, s) / self.units
+            if np.abs(psi / self.rows).max() <= ALMOST_CLOSED:
+                return np.concatenate([q, x[-1:]]) / self.units
         return None
 
 
