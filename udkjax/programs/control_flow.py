@@ -14,7 +14,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, PyTree
 
-from udkjax.arrays import ArrayLibrary, is_traced, is_within_jit, put_arrays
+from udkjax.arrays import ArrayLibrary, Module, is_traced, is_within_jit, put_arrays
 from udkjax.programs.deferred import deferred
 from udkjax.programs.identity_cache import cached_by_identity
 from udkjax.programs.undefined import defined
@@ -121,12 +121,13 @@ class ConvertsItself:
 
 def _by_numpy(x: Any, is_module: bool = False) -> Any:
     if is_module:
-        return x if isinstance(x, ConvertsItself) else _concrete_module(x)
+        return x if isinstance(x, ConvertsItself) else by_numpy_arrays(x)
     return np.asarray(x) if isinstance(x, jax.Array) else x
 
 
 @cached_by_identity  # the same object for the same module, so that what is computed from it is found again
-def _concrete_module(module: eqx.Module) -> eqx.Module:
+def by_numpy_arrays(module: Module) -> Module:
+    """Return a module of concrete numbers with NumPy's arrays."""
     return jax.tree.map(_by_numpy, module)
 
 

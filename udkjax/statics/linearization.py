@@ -106,7 +106,7 @@ class NumpyLinearizer:
         return latest[1]
 
     def _linearize(self, t: Any, q: Any) -> Linearization:
-        if self._direction is not None and (eliminated := self._eliminate(t, q)) is not None:
+        if (eliminated := self._eliminate(t, q)) is not None:
             return eliminated
         terms, root, w = self._terms, self._root, self._weights
         at_rest = terms.loads_at_rest(t, q)
@@ -128,13 +128,16 @@ class NumpyLinearizer:
 
     def _eliminate(self, t: Any, q: Any) -> Linearization | None:
         """Return the linearization in one direction; None if that needs singular values."""
-        found = self._eliminated and self._eliminated.linearization(float(t), q, self._direction)
+        if self._eliminated is None or self._direction is None:
+            return None
+        found = self._eliminated.linearization(float(t), q, self._direction)
         if not found or not (square := found[REDUCED][0]) > CLEARLY_ALONG**2:
             return None
         N, force = found["dq1"] / math.sqrt(square), self._terms.mass * found["dv"]
         _, stiffness, damping = found[REDUCED] / square
-        reduced: tuple[Any, ...] = np.ones((1, 1)), damping.reshape(1, 1), stiffness.reshape(1, 1), np.array([N @ force])
-        return Linearization(N[:, None], *reduced, force, -found["multipliers"])
+        reduced = np.ones((1, 1)), damping.reshape(1, 1), stiffness.reshape(1, 1), np.array([N @ force])
+        together: tuple[Any, ...] = N[:, None], *reduced, force, -found["multipliers"]
+        return Linearization._make(together)
 
     def scale(self, t: Any, q: Any) -> LoadScale:
         """Return the scales of forces and stiffnesses at rest."""

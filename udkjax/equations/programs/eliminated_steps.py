@@ -33,24 +33,25 @@ class Eliminated:
 
     def newton_step(self, t: float, q: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
         """Return q after the smallest step to Psi = 0, and Psi of all rows before it; None if another method is needed."""
-        found = self._is_ready() and self._arrays.newton_step(t, q)
+        found = (arrays := self._prepared()) and arrays.newton_step(t, q)
         return None if not found or not found[2] > CLEAR else found[:2]
 
     def linearization(self, t: float, q: np.ndarray, direction: np.ndarray) -> dict[str, np.ndarray] | None:
         """Return the arrays of `SceneArrays.linearization`; None if another method is needed."""
-        found = self._is_ready() and self._arrays.linearization(t, q, direction)
+        found = (arrays := self._prepared()) and arrays.linearization(t, q, direction)
         return None if not found or not found["distance"][0] > CLEAR else found
 
-    def _is_ready(self) -> bool:
+    def _prepared(self) -> SceneArrays[np.ndarray] | None:
+        """Return the programs; None until they are worth it."""
         if self._arrays is None:
             if len(self._uses) < WORTH:
                 self._uses.append(0)
-                return False
+                return None
             kind, numbers, redundant_rows, length = self._given
             programs = programs_of_structure(*kind, redundant_rows)
             numbers = numbers if length is None else programs.with_unit_masses(numbers, length)
             self._arrays = SceneArrays(programs, numbers, np)
-        return True
+        return self._arrays
 
 
 @lru_cache(maxsize=64)

@@ -15,7 +15,17 @@ from udkjax.expressions.loops.array_loops import ArrayLoops
 from udkjax.programs.identity_cache import cached_by_identity
 from udkjax.scene.mechanism import Mechanism
 
+ACCELERATIONS = "a", "multipliers", "distance", "psi_q"
 LINEARIZATION = "dq1", "dv", "dv1", "multipliers", "distance", REDUCED
+
+
+class Accelerations(NamedTuple):
+    """Accelerations (n, T), multipliers (m, T), distances from dependent rows (T,) and entries of Psi_q (entries, T)."""
+
+    a: np.ndarray
+    multipliers: np.ndarray
+    distance: np.ndarray
+    entries: np.ndarray
 
 
 class SceneArrays(Generic[AnyArray]):
@@ -88,6 +98,12 @@ class SceneArrays(Generic[AnyArray]):
         """
         return self._run_at_state(LINEARIZATION, t, q, self._xp.zeros_like(q), {"dq": direction}, often=True)
 
+    def accelerations(self, t: Time, q: AnyArray, v: AnyArray) -> "Accelerations | None":
+        """Return accelerations at many states by elimination; None if a program by machine code is not worth it yet."""
+        found: Any = self._run_at_many(ACCELERATIONS, {"t": np.asarray(t, float).reshape(1, -1), "q": q, "v": v})
+        entries: Any = found and self._entries(found)
+        return found and Accelerations(found["a"], found["multipliers"], found["distance"][0], entries)
+
     def newton_step(self, t: Time, q: AnyArray) -> tuple[AnyArray, AnyArray, float] | None:
         """Return q (n,) after a Newton step to Psi = 0 by elimination, Psi (m,) at q, and the distance from dependent rows.
 
@@ -102,15 +118,21 @@ class SceneArrays(Generic[AnyArray]):
         many = q.shape[1:]
         if not many and xp is np and (found := self._run_at_state(outputs, t, q, v, given)) is not None:
             return found
-        evaluate, sizes, _ = self._evaluator(outputs)
         if many and xp is np:
             state = {"t": np.asarray(t, float).reshape(1, -1), "q": q, "v": v, **given}
-            if (compiled := evaluate.at_many(sizes, {name: len(x) for name, x in state.items()})) is not None:
-                return compiled(np.asarray(self._constants), state)
+            if (found := self._run_at_many(outputs, state)) is not None:
+                return found
+        evaluate, sizes, _ = self._evaluator(outputs)
         blank = {x: xp.zeros((size, *many)) for x, size in sizes.items()}
         constants = self._constants[:, None] if many else self._constants
         state = {"constants": constants, "t": xp.reshape(xp.asarray(t, float), (1, *many)), "q": q, "v": v}
         return evaluate(blank | state | given)
+
+    def _run_at_many(self, outputs: tuple[str, ...], state: Mapping[str, Any]) -> dict[str, AnyArray] | None:
+        """Run a program at many states by machine code; None if that is not worth it yet, or impossible."""
+        evaluate, sizes, _ = self._evaluator(outputs)
+        compiled: Any = evaluate.at_many(sizes, {name: len(x) for name, x in state.items()})
+        return None if compiled is None else compiled(np.asarray(self._constants), state)
 
     def _run_at_state(
         self, outputs: tuple[str, ...], t: Any, q: AnyArray, v: AnyArray, given: Mapping[str, AnyArray], often: bool = False
@@ -174,7 +196,7 @@ def _evaluator(programs: ScenePrograms, xp: ArrayLibrary, *outputs: str) -> _Eva
     at_rest = p.at_rest.sizes if outputs[0] in (*OF_LOADS, CURVATURE) or outputs == LINEARIZATION else {}
     program = p.linearization if outputs == LINEARIZATION else p.at_rest.of(*outputs) if at_rest else p.of(*outputs)
     sizes = p.scratch | {"psi": m, "psi_dot": m, "multipliers": m, "terms": p.term_count, "energy": 2} | at_rest
-    sizes |= dict.fromkeys(("q1", "dq1", "dv", "dv1"), n) | {"distance": 1, REDUCED: 3}
+    sizes |= dict.fromkeys(("a", "q1", "dq1", "dv", "dv1"), n) | {"distance": 1, REDUCED: 3}
     results = tuple(x for x in outputs if not at_rest or x in program.written)
     given = {"multipliers"} if outputs == (CURVATURE,) else set()
     blank = {x: size for x, size in sizes.items() if x in (program.arrays | set(results)) - given}

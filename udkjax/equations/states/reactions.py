@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float
 
 from udkjax.annotations import Number, NumberLike
 from udkjax.argument_types import ARRAYS_BY_NAME, HISTORY, NOT_NEGATIVE
-from udkjax.arrays import ArrayLibrary, array_namespace
+from udkjax.arrays import ArrayLibrary, array_namespace, put_arrays
 from udkjax.equations.friction.compliance import compliance_rows
 from udkjax.equations.laws.abstract_system import HistoryLike, times_of
 from udkjax.equations.laws.udwadia_kalaba import Baumgarte
@@ -27,6 +27,7 @@ from udkjax.equations.states.textbook import prepare
 from udkjax.equations.systems.general import ConstrainedSystem, prepare_general
 from udkjax.equations.terms.constraints import psi_q
 from udkjax.pinv import SVD, Pseudoinverse
+from udkjax.programs.control_flow import by_numpy_arrays
 from udkjax.programs.deferred import deferred
 from udkjax.programs.undefined import at_each
 from udkjax.scene.arguments import checked
@@ -83,17 +84,14 @@ def reactions(
             raise ValueError("the coordinates of a ConstrainedSystem have no frame: leave out frame, about and compliances")
         states = _states(solution)
         return _loads_of_rows(mechanism.traced(states[1].shape[-1]), *states, SVD() if method is None else method, stabilization)
-    scene, method, states = scene_along(mechanism, solution), SVD() if method is None else method, _states(solution)
+    scene, method = scene_along(mechanism, solution), SVD() if method is None else method
     stabilization = scene.gains(stabilization)
     soft = None if compliances is None else compliance_rows(scene.mechanism, compliances)
-    if (
-        soft is None
-        and scene.knowledge.is_constant
-        and by_numpy(scene.mechanism, (states, scene.analysis, stabilization), method)
-    ):
+    given = times_of(solution), solution.q, solution.v, scene.analysis, stabilization
+    if soft is None and scene.knowledge.is_constant and by_numpy(scene.mechanism, given, method):
         loads = _loads_by_numpy(*scene[:2], history_of(solution), method, stabilization, frame=frame, about=about)
     else:
-        loads = _loads(*scene[:3], *states, method, stabilization, soft, frame, about)
+        loads = _loads(*scene[:3], *_states(solution), method, stabilization, soft, frame, about)
     return _name_by_body(scene, loads, jnp.add)
 
 
@@ -119,11 +117,12 @@ def unique_reactions(
     Returns:
         For each joint and driver, and each of its bodies, booleans (T, 3) for force x, force y and torque.
     """
-    scene, (ts, q, _) = scene_along(mechanism, solution), _states(solution)
-    if scene.knowledge.is_constant and by_numpy(scene.mechanism, (ts, q, scene.analysis, rank_tol)):
+    scene = scene_along(mechanism, solution)
+    given = times_of(solution), solution.q, scene.analysis, rank_tol
+    if scene.knowledge.is_constant and by_numpy(scene.mechanism, given):
         marks = _uniqueness_by_numpy(*scene[:2], history_of(solution)[:2], rank_tol, frame, about)
     else:
-        marks = _uniqueness_of_loads(*scene[:3], ts, q, jnp.asarray(rank_tol), frame, about)
+        marks = _uniqueness_of_loads(*scene[:3], *_states(solution)[:2], jnp.asarray(rank_tol), frame, about)
     return _name_by_body(scene, marks, jnp.logical_and)
 
 
@@ -295,7 +294,7 @@ def _loads_by_numpy(
         by_row = -arrays.dense(found.entries) * found.multipliers[:, :, None]
         return _split_by_body(numbers, rows, q, by_row, lambda load: load.sum(0), frame, about)
 
-    numbers = jax.tree.map(np.asarray, mechanism)
+    numbers = by_numpy_arrays(mechanism)
     return _joined(arrays, history, of_piece)
 
 
@@ -316,13 +315,13 @@ def _uniqueness_by_numpy(
             for name, loads in by_body.items()
         }
 
-    numbers = jax.tree.map(np.asarray, mechanism)
+    numbers = by_numpy_arrays(mechanism)
     return _joined(arrays, history, of_piece)
 
 
 def _joined(arrays: StateArrays, history: tuple[np.ndarray, ...], of_piece: Callable[..., ByBody]) -> list[list[Array]]:
     """Evaluate a quantity of each constraint and body in pieces of a history, and join them."""
     pieces = [of_piece(*(x[p] for x in history)) for p in arrays.pieces(len(history[0]))]
-    return jax.device_put(
+    return put_arrays(
         [[np.concatenate([piece[name][body] for piece in pieces]) for body in loads] for name, loads in pieces[0].items()]
     )
