@@ -4,6 +4,7 @@ from udkjax.programs.control_flow import BY_JAX as BY_JAX
 from udkjax.programs.control_flow import BY_NUMPY as BY_NUMPY
 from udkjax.programs.control_flow import ControlFlow as ControlFlow
 from udkjax.programs.control_flow import ConvertsItself as ConvertsItself
+from udkjax.programs.control_flow import by_numpy_arrays as by_numpy_arrays
 from udkjax.programs.control_flow import cond_of_batch as cond_of_batch
 from udkjax.programs.control_flow import sequential as sequential
 from udkjax.programs.control_flow import solve as solve

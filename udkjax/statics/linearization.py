@@ -24,7 +24,6 @@ from udkjax.equations import udwadia_kalaba as uk
 from udkjax.equations.elimination.dense_pseudoinverse import dense_pseudoinverse
 from udkjax.equations.rows.analysis import Analysis
 from udkjax.equations.rows.dense_rows import DenseTerms
-from udkjax.equations.terms.rest_program import REDUCED
 from udkjax.pinv import SVD
 from udkjax.programs.control_flow import BY_JAX, ControlFlow
 from udkjax.programs.identity_cache import cached_by_identity
@@ -131,12 +130,19 @@ class NumpyLinearizer:
         if self._eliminated is None or self._direction is None:
             return None
         found = self._eliminated.linearization(float(t), q, self._direction)
-        if not found or not (square := found[REDUCED][0]) > CLEARLY_ALONG**2:
+        if found is None or not found.square > CLEARLY_ALONG**2:
             return None
-        N, force = found["dq1"] / math.sqrt(square), self._terms.mass * found["dv"]
-        _, stiffness, damping = found[REDUCED] / square
-        reduced = np.ones((1, 1)), damping.reshape(1, 1), stiffness.reshape(1, 1), np.array([N @ force])
-        together: tuple[Any, ...] = N[:, None], *reduced, force, -found["multipliers"]
+        N, force = found.u / math.sqrt(found.square), self._terms.mass * found.free
+        damping, stiffness = (np.array([[x / found.square]]) for x in (found.damping, found.stiffness))
+        together: tuple[Any, ...] = (
+            N[:, None],
+            np.ones((1, 1)),
+            damping,
+            stiffness,
+            np.array([N @ force]),
+            force,
+            found.multipliers,
+        )
         return Linearization._make(together)
 
     def scale(self, t: Any, q: Any) -> LoadScale:

@@ -6,15 +6,28 @@ corrections by singular values.
 """
 
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
 from udkjax.equations.programs.scene_arrays import SceneArrays
 from udkjax.equations.programs.scene_programs import programs_of_structure
+from udkjax.equations.terms.rest_program import REDUCED
 from udkjax.equations.terms.structure import Structure
 
 WORTH = 100  # answers for one structure by singular values before elimination is prepared
 CLEAR = 0.1  # smallest relative distance from dependent rows: elimination loses accuracy by the square of its reciprocal
+
+
+class AlongTangent(NamedTuple):
+    """A linearization at rest along a direction u that the constraints allow."""
+
+    u: np.ndarray
+    square: float  # u^T M u
+    stiffness: float  # u^T K u
+    damping: float  # u^T C u
+    free: np.ndarray  # a_F = M^(-1) F
+    multipliers: np.ndarray  # lambda of F = Psi_q^T lambda + a part along the constraints
 
 
 class Eliminated:
@@ -36,10 +49,13 @@ class Eliminated:
         found = (arrays := self._prepared()) and arrays.newton_step(t, q)
         return None if not found or not found[2] > CLEAR else found[:2]
 
-    def linearization(self, t: float, q: np.ndarray, direction: np.ndarray) -> dict[str, np.ndarray] | None:
-        """Return the arrays of `SceneArrays.linearization`; None if another method is needed."""
+    def linearization(self, t: float, q: np.ndarray, direction: np.ndarray) -> "AlongTangent | None":
+        """Return the linearization at rest along the tangent part of a direction; None if another method is needed."""
         found = (arrays := self._prepared()) and arrays.linearization(t, q, direction)
-        return None if not found or not found["distance"][0] > CLEAR else found
+        if not found or not found["distance"][0] > CLEAR:
+            return None
+        square, stiffness, damping = found[REDUCED].tolist()
+        return AlongTangent(found["dq1"], square, stiffness, damping, found["dv"], -found["multipliers"])
 
     def _prepared(self) -> SceneArrays[np.ndarray] | None:
         """Return the programs; None until they are worth it."""

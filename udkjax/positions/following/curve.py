@@ -1,6 +1,7 @@
 """Positions of a driven mechanism as a curve Psi(s, q) = 0 in scaled coordinates and value, X = (q, s)."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, ClassVar
@@ -13,7 +14,6 @@ from jaxtyping import Array, Bool, Float
 from udkjax.arrays import library_for, number
 from udkjax.equations import constraints
 from udkjax.equations.elimination.dense_pseudoinverse import dense_pseudoinverse
-from udkjax.equations.programs.eliminated_steps import Eliminated
 from udkjax.equations.rows.analysis import Analysis
 from udkjax.equations.rows.dense_rows import DenseTerms
 from udkjax.equations.rows.position_closure import CLOSURE
@@ -184,7 +184,7 @@ class NumpyCurve(AbstractCurve):
     units: Float[np.ndarray, "n+1"]
     rows: Float[np.ndarray, "m"]
     independent: tuple[int, ...]
-    eliminated: Eliminated | None  # `DenseTerms.eliminated`
+    newton_step: Callable[[float, np.ndarray], tuple[np.ndarray, np.ndarray] | None] | None  # of `DenseTerms.eliminated`
 
     by: ClassVar[ControlFlow] = BY_NUMPY
 
@@ -199,7 +199,8 @@ class NumpyCurve(AbstractCurve):
         units = np.append(np.tile([scales.length, scales.length, 1.0], analysis.coordinates // 3), unit)
         terms = DenseTerms.of(mechanism)
         eliminated = terms.eliminated(analysis.redundant_rows or (), float(scales.length))
-        return cls(terms, scales.weights, units, scales.rows, analysis.independent_rows, eliminated)
+        step = None if eliminated is None else eliminated.newton_step
+        return cls(terms, scales.weights, units, scales.rows, analysis.independent_rows, step)
 
     @cached_property
     def _factors(self) -> Float[np.ndarray, "m n+1"]:
@@ -267,7 +268,7 @@ class NumpyCurve(AbstractCurve):
         x = X * self.units
         q, s = x[:-1], float(x[-1])
         for _ in range(NEWTON_STEPS):
-            found = self.eliminated and self.eliminated.newton_step(s, q)
+            found = self.newton_step and self.newton_step(s, q)
             if not found:
                 return None
             q, psi = found
