@@ -266,3 +266,14 @@ def test_both_engines_find_the_same():
     assert [sol.settings["engine"] for sol in found] == ["native", "jax: it was asked for"]
     assert np.abs(found[0].events.time - found[1].events.time).max() < 1e-10
     assert np.abs(found[0].q - found[1].q).max() < 1e-9
+
+
+def test_only_contacts_are_listed_to_rest():
+    """Other events cannot rest, and have no count of it."""
+    ball = udk.Mechanism({"ball": udk.Body(1.0, 0.1, (0.0, 1.0))})
+    half = udk.Event(lambda t, at: at["ball"].y - 0.5, udk.Log(), name="half")
+    found = udk.simulate(ball, [0.0, 1.0], events=[half, udk.Contact("ball")]).events
+    floor = "ball on ground"
+    assert {name: int(n) for name, n in found.counts.items()} == {"half": 1, floor: 1, f"{floor} lets go": 0, f"{floor} rests": 1}
+    with pytest.raises(ValueError, match="half rests"):
+        found.of("half rests")

@@ -32,10 +32,15 @@ class Listing(NamedTuple):
 
 
 def names_of_events(events: Sequence[Event], phases: Phases) -> tuple[str, ...]:
-    """Return the names of all events that may be listed; `events` are the user's, then those of joints that stick, then kinks."""
-    names = tuple(e.name for e in events[: _own_count(events, phases)])
-    others = (f"{name} {text}" for text in ("lets go", "rests") for name in names)
-    return (*names, *others, *(f"{x.name} {text}" for x in phases.sticking for text in TRANSITIONS))
+    """Return the names of all events that may be listed, "" in places of those that cannot happen: only contacts rest.
+
+    Args:
+        events: The user's, then those of joints that stick, then kinks.
+        phases: The phases.
+    """
+    own = events[: _own_count(events, phases)]
+    others = (f"{e.name} {text}" if e.action.is_impact else "" for text in ("lets go", "rests") for e in own)
+    return (*(e.name for e in own), *others, *(f"{x.name} {text}" for x in phases.sticking for text in TRANSITIONS))
 
 
 def _own_count(events: Sequence[Event], phases: Phases) -> int:

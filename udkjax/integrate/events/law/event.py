@@ -173,7 +173,7 @@ class Events(PrintsTable):
         q_after: positions right after it.
         v_after: velocities right after it.
         count: number of events.
-        names: the names of the conditions.
+        names: the names of the events; "" where none can happen.
     """
 
     time: Float[Array, "events"]
@@ -199,7 +199,7 @@ class Events(PrintsTable):
 
     def of(self, name: str) -> Float[Array, "k"]:
         """Return the times (s) of the events with a name, in a single run."""
-        require_name(name, self.names, "events", "event")
+        require_name(name, [x for x in self.names if x], "events", "event")
         return self.time[np.asarray(self.index) == self.names.index(name)]
 
     @property
@@ -210,7 +210,7 @@ class Events(PrintsTable):
     @property
     def counts(self) -> dict[str, Int[Array, ""]]:
         """The number of events of each name."""
-        return {name: (self.index == k).sum(-1) for k, name in enumerate(self.names)}
+        return {name: (self.index == k).sum(-1) for k, name in enumerate(self.names) if name}
 
 
 class ExpandsToEvents(Protocol):

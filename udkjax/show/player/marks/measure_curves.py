@@ -161,7 +161,7 @@ def sticking_spans(mechanism: Mechanism, solution: ShownMotion) -> list[JsonObje
     A span begins and ends at the events of its joint, or else at output times. Contacts with friction are left out.
     """
     ts, events = np.asarray(solution.ts, float), getattr(solution, "events", None)
-    happened = {} if events is None else {name: events.of(name) for name in events.names}
+    happened = {} if events is None else {name: events.of(name) for name in events.names if name}
     found: list[JsonObject] = []
     for name, sticks in (getattr(solution, "sticking", None) or {}).items():
         if name not in mechanism.joints:
