@@ -252,10 +252,14 @@ def test_links_that_touch_are_red_and_a_click_shows_where_they_are_closest(studi
     q = studio.js("Array.from(studio.motion.pageEngine.at(studio.motion.run, studio.motion.t).q)")
     np.testing.assert_allclose(np.reshape(q, (-1, 3)), found.least.q, atol=1e-5)
     assert found.least.distance < 0 and studio.js(painted) == 2
+    studio.js("studio.files.export('touching.svg', null)")
+    assert 'class="touching"' in (studio.folder / "touching.svg").read_text()
     away = found.least.value + np.pi  # half a turn later, links are apart
     studio.js(f"studio.motion.goTo('{np.degrees(away + found.count.offset):.6f} deg')")
     studio.page.wait_for_timeout(100)
     assert studio.js(painted) == 0
+    studio.js("studio.files.export('apart.svg', null)")
+    assert 'class="touching"' not in (studio.folder / "apart.svg").read_text()
     studio.js("studio.commit({...studio.document, pins: {...studio.document.pins, E: [10, 10]}})")
     assert studio.js("studio.answers.gaps.found") is None
     assert not studio.problems

@@ -66,7 +66,7 @@ def test_free_links_without_mass_need_one_or_a_motor():
 
 
 def test_an_export_that_needs_masses_says_how_to_give_them(client):
-    found = client.ask("save", path="a.svg", text=changed(link=links(), motor=None), revision=None, export=True)
+    found = client.ask("save", path="a.gif", text=changed(link=links(), motor=None), revision=None, export=True)
     assert found.status_code == 422
     assert found.json()["problem"].endswith("select each, and type its mass, or put a motor on a pin (Motor, M)")
 

@@ -57,7 +57,7 @@ def animate(
         measures: curves over time: violation (of the constraints), energy, rank, or a variable of the file over time.
         reactions: draw the forces of the joints as arrows.
         traces: joints or bodies whose paths are drawn; by default the moving pins.
-        gaps: paint links red while they touch, and add a button that leads to the least gap between links of a page.
+        gaps: paint links red while they touch, on pages, in films and pictures; a button of a page leads to their least gap.
         live: make a page that simulates, with bodies to drag and a slider for every number of the scene, or for those that are
             named (motor.crank.speed, pin.B).
         theme: colours; by default, on a page, the preference of the reader's system, otherwise light.
@@ -78,8 +78,8 @@ def animate(
         refuse(f"{len(labels)} --labels for {len(files)} files")
     if live is not None and kind != ".html":
         refuse(f"--live makes a page that simulates: --out must be a .html file, not {out.name}")
-    if gaps and kind != ".html":
-        refuse(f"--gaps marks links on a page: --out must be a .html file, not {out.name}")
+    if gaps and kind == ".dxf":
+        refuse(f"--gaps paints links red: --out must be a page, a film or a picture, not {out.name}")
     names = list(labels or (file.stem if len(files) > 1 else "" for file in files))
     if len(set(names)) < len(names):
         refuse(f"runs must have different labels, not {', '.join(names)}: give --labels")

@@ -3,7 +3,8 @@
     POST /api/list        {}                                          -> {files, templates, folder}
     POST /api/open        {path}, {template} or {address}             -> {text, document, path, revision, problems}
     POST /api/share       {text}                                      -> {address} of a drawing
-    POST /api/save        {path, text, revision, export?, table?}     -> {path, revision}, or 409 with the revision on disk
+    POST /api/save        {path, text, revision, export?, table?,     -> {path, revision}, or 409 with the revision on disk
+                           pose?, gaps?}
     POST /api/compile     {text, document?, engine?}                  -> {text, document, problems, scene, engine}
     POST /api/diagnose    {text, about?, end?}                        -> findings about the drawing
     POST /api/design      {path, unit?, seed?}                        -> mechanisms with a point on a wanted path
@@ -84,7 +85,10 @@ class Studio:
         if suffix == ".csv" and isinstance(request.get("table"), str):  # the curves of the page
             data = request["table"].encode()
             return {"path": path, "revision": self.folder.write(path, data, revision, EXPORTS), "bytes": len(data)}
-        exported = self.examiner.call("export", {"text": text, "suffix": suffix}, EXPORT_SECONDS)
+        shown = {"pose": request.get("pose") or {}, "has_gaps": request.get("gaps") is True}
+        if not isinstance(shown["pose"], dict):
+            raise RefusedError(400, "pose: must be an object")
+        exported = self.examiner.call("export", {"text": text, "suffix": suffix, **shown}, EXPORT_SECONDS)
         data = bytes.fromhex(exported["data"])
         return {"path": path, "revision": self.folder.write(path, data, revision, EXPORTS), "bytes": len(data)}
 

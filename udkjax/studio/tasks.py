@@ -230,12 +230,12 @@ def diagnose_drawing(text: str, about: str = "structure", end: JsonObject | None
         return in_studio_words({"problems": [str(error)]})
 
 
-def export(text: str, suffix: str) -> JsonObject:
-    """Return an export of a drawing as hexadecimal bytes."""
+def export(text: str, suffix: str, pose: JsonObject | None = None, has_gaps: bool = False) -> JsonObject:
+    """Return an export of a drawing as hexadecimal bytes; `pose` and `has_gaps` are those of `exported`."""
     try:
         require_few(read_document(text))
         mechanism = loads(text)
-        data = exported(mechanism, text, suffix)
+        data = exported(mechanism, text, suffix, pose, has_gaps)
         return {"data": data.hex()}
     except (SceneError, ArgumentError) as error:
         problems = error.problems if isinstance(error, SceneError) else [str(error)]

@@ -73,7 +73,11 @@ def test_a_page_has_the_outlines_the_least_gap_and_the_ends_of_contacts(wide):
     bars = {part["body"]: part for part in record["gaps"]["parts"]}
     assert bars[0]["radius"] == 0.03 and bars[2]["radius"] == 0.035 and record["gaps"]["pairs"] == [[[0], [1]]]
     assert np.ptp(bars[0]["points"], axis=0) == pytest.approx([0.05, 0.0], abs=1e-15)
-    assert plain.data["runs"][0] == {k: v for k, v in record.items() if k != "gaps"} | {"events": []}
+    seen = ("gaps", "symbols")  # symbols have the size of the picture
+    assert {k: v for k, v in plain.data["runs"][0].items() if k != "symbols"} == {
+        k: v for k, v in record.items() if k not in seen
+    } | {"events": []}
+    assert marked.data["bounds"][0] < plain.data["bounds"][0] - 0.02 and marked.data["bounds"][3] > plain.data["bounds"][3] + 0.02
     assert "paintTouching(painter, {" in page(marked.data) and "paintTouching(painter, {" not in page(plain.data)
     assert len(page(marked.data)) < len(page(plain.data)) + 4000
 
@@ -102,10 +106,42 @@ def test_wrong_gaps_are_refused_by_name(wide, tmp_path, capsys):
     with pytest.raises(udk.SceneError, match="has no outline"):
         udk.animate(udk.library.parallelogram(), udk.simulate(udk.library.parallelogram(), [0.0, 0.1]), gaps=True)
     udk.save(mech, scene := tmp_path / "scene.toml")
-    assert udkjax("animate", scene, "--gaps", "--out", tmp_path / "x.svg") == 2
-    assert "--out must be a .html file" in capsys.readouterr().err
+    assert udkjax("animate", scene, "--gaps", "--out", tmp_path / "x.dxf") == 2
+    assert "--out must be a page, a film or a picture, not x.dxf" in capsys.readouterr().err
     assert udkjax("animate", scene, "--gaps", "--t1", 1, "--out", out := tmp_path / "x.html") == 0
     assert "crank and rocker touch" in out.read_text()
+
+
+def test_links_that_touch_are_red_in_pictures_and_films(wide, tmp_path):
+    from udkjax.show.player.films import image
+    from udkjax.show.player.pictures import sketches
+
+    mech, run = wide
+    plain, marked, least = udk.animate(mech, run), udk.animate(mech, run, gaps=True), udk.gaps(mech, run=run).least
+    contacts = udk.gaps(mech, run=run).contacts
+    for t in (*np.linspace(0.03, 1.97, 20), least.value):
+        names = {mech.body_names[part["body"]] for part in marked.touching(t)[0]}
+        assert names == ({"crank", "rocker"} if any(touch.begins < t < touch.ceases for touch in contacts) else set()), t
+    red, view = {}, sketches(marked, 0.0, 640, "light")[0]
+    for t in (0.0, least.value):
+        svg = marked.save(tmp_path / "x.svg", t).read_text()
+        assert plain.touching(t) == [[]] and "touching" not in plain.save(tmp_path / "y.svg", t).read_text()
+        lines = [line for line in svg.splitlines() if 'class="touching"' in line]
+        assert [f'stroke-width="{2 * view.scale * radius:.2f}"' in line for line, radius in zip(lines, (0.03, 0.035))] == [
+            True
+        ] * len(lines)
+        pixels = np.asarray(image(marked, t), float)
+        red[t] = np.mean((pixels[..., 0] - pixels[..., 1:].max(-1)) > 60)
+        red[t, "plain"] = np.mean((np.asarray(image(plain, t), float) @ [1, -0.5, -0.5]) > 60)
+        marked.save(tmp_path / "x.dxf", t)
+    assert red[least.value] > 0.05 > red[0.0] and red[least.value] > 3 * red[least.value, "plain"]
+    areas = [part | {"points": part["points"] + [[0.1, 0.2]]} for part in marked.touching(least.value)[0]]  # of plates
+    discs = [part | {"points": part["points"][:1]} for part in areas]
+    from udkjax.show.player.marks.sketch import Circle, Line, Sketch
+
+    shapes = Sketch([], marked.pose(0.0)[0], view, touching=[*areas, *discs]).shapes
+    assert [type(shape) for shape in shapes] == [Line, Line, Circle, Circle]
+    assert shapes[0].closed and shapes[0].fill and shapes[2].radius == pytest.approx(view.scale * 0.03)
 
 
 def test_the_button_leads_to_the_least_gap_and_links_that_touch_are_red(opened, wide):

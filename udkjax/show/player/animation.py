@@ -18,7 +18,7 @@ from udkjax.integrate.simulate import simulate
 from udkjax.scene.arguments import checked, require_mechanism
 from udkjax.scene.mechanism import Mechanism
 from udkjax.show.player import pictures
-from udkjax.show.player.gap_records import ShownGaps, add_gaps
+from udkjax.show.player.gap_records import ShownGaps, add_gaps, touching_at
 from udkjax.show.player.live import live_data
 from udkjax.show.player.live_parameters import Live
 from udkjax.show.player.marks.drawn_systems import PlacesBodies, drawn_system
@@ -140,6 +140,10 @@ class Animation:
         t = float(self.data["start"] if t is None else t)
         return [stuck_at(record, t) for record in self.data["runs"]]
 
+    def touching(self, t: float | None = None) -> list[list[JsonObject]]:
+        """Return the outlines {body, points, radius} of the links of each run that touch at time t (s), if gaps are shown."""
+        return [touching_at(record, pose) for record, pose in zip(self.data["runs"], self.pose(t), strict=True)]
+
     def labels(self) -> list[PictureLabels]:
         """Return the names of points and the lengths of links of each run."""
         shown = zip(self.mechanisms, self.data["runs"], strict=True)
@@ -195,9 +199,9 @@ def animate(
             slider; True adds sliders for all numbers of the scene. A slider acts on all runs that have its parameter. Without
             `solution`, ten seconds are simulated. A live page has all of these, which follow its numbers, but
             "rank"; your own measures are shown for the first motion only.
-        gaps: True to paint links red while they touch, with marks on the timeline where they begin and cease to, and a button
-            that leads to the least gap between links; for other pairs or shapes than those of `udkjax.gaps` by default, its
-            result for the run, or results by label. A live page, whose motion changes, has none.
+        gaps: True to paint links red while they touch, also in pictures and films; a page has marks on the timeline where they
+            begin and cease to, and a button that leads to the least gap between links. For other pairs or shapes than those of
+            `udkjax.gaps` by default, its result for the run, or results by label. A live page, whose motion changes, has none.
         events: events of live runs, as for `simulate`; the page locates them in each new motion. It supports the actions `Log`,
             `Stop` and `Impact` (one contact at a time), and draws the lines of contacts.
 

@@ -10,7 +10,18 @@ from jaxtyping import Float
 from udkjax.annotations import JsonObject
 from udkjax.extras import OptionalImport
 from udkjax.show.player.marks.mark_kinds import MarkKind
-from udkjax.show.player.marks.sketch import THEMES, Circle, ForceArrow, Line, Sketch, Text, TracedPath, View, view_of
+from udkjax.show.player.marks.sketch import (
+    THEMES,
+    TOUCHING,
+    Circle,
+    ForceArrow,
+    Line,
+    Sketch,
+    Text,
+    TracedPath,
+    View,
+    view_of,
+)
 from udkjax.show.player.picture_labels import PictureLabels, Placing
 
 DXF_LAYERS: dict[str, str] = {
@@ -46,6 +57,10 @@ class Posed(Protocol):
         """Return the places of the joints of each run that stick at time t."""
         ...
 
+    def touching(self, t: float | None = None) -> list[list[JsonObject]]:
+        """Return the outlines of the links of each run that touch at time t."""
+        ...
+
     def labels(self) -> list[PictureLabels]:
         """Return the names of points and the lengths of links of each run."""
         ...
@@ -62,8 +77,9 @@ def sketches(
         raise ValueError(f"theme {theme!r} must be {' or '.join(THEMES)}")
     runs = animation.data["runs"]
     view = view_of(animation.data["bounds"], width // len(runs), times, any(run["reactions"] for run in runs))
-    shown = zip(runs, animation.pose(t), animation.paths(), animation.arrows(t), animation.sticking(t), strict=True)
-    found = [Sketch(run["marks"], pose, view, theme, paths, arrows, stuck) for run, pose, paths, arrows, stuck in shown]
+    parts = animation.paths(), animation.arrows(t), animation.sticking(t), animation.touching(t)
+    shown = zip(runs, animation.pose(t), *parts, strict=True)
+    found = [Sketch(run["marks"], pose, view, theme, *rest) for run, pose, *rest in shown]
     for sketch, words in zip(found, animation.labels() if labels else [], strict=labels):
         sketch.shapes += Placing(words, sketch).shapes()
     return view, found
@@ -119,7 +135,7 @@ def save_dxf(animation: Posed, path: Path, t: float | None = None, labels: bool 
     if labels:
         _label(drawing, Placing(animation.labels()[0], panels[0]), view)
     for shape in panels[0].shapes:
-        if isinstance(shape, Text):
+        if isinstance(shape, Text) or shape.layer == TOUCHING:  # which has no lines of its own
             continue
         layer = DXF_LAYERS.get(shape.layer, f"{shape.layer}s")
         if layer not in drawing.layers:

@@ -284,6 +284,9 @@ def _box(mechanism: Mechanism, record: Record, poses: Float[np.ndarray, "T bodie
             hold(mark["body"], np.add(point, mark.get("at", (0.0, 0.0))))
         for k, x, y in (mark[end] for end in ("a", "b") if end in mark):
             hold(int(k), (x, y))
+    for part in record.get("gaps", {}).get("parts", []):  # links that touch are painted in their full width
+        for point in part["points"]:
+            hold(part["body"], point, part["radius"])
     for body, *at in [*record["traces"], *([k, 0.0, 0.0] for k in range(len(mechanism.bodies)))]:
         hold(int(body), at)
     least = 0.1 * float(analyse(mechanism).length)  # the box of a bar that moves along its line has no height

@@ -178,7 +178,8 @@ export class FileActions {
     this.studio.say(`exporting ${path} …`);
     try {
       const text = await this.text(), table = path.endsWith(".csv") ? this.studio.curves.table() : "";
-      const {bytes} = await ask("save", {path, text, revision, export: true, ...(table && {table})});
+      const {motion, answers} = this.studio, pose = motion.posed ? {q: Array.from(motion.posed.q)} : motion.t > 0 ? {t: motion.t} : {};
+      const {bytes} = await ask("save", {path, text, revision, export: true, pose, gaps: answers.gaps.found !== null, ...(table && {table})});
       this.studio.say(`wrote ${path} (${Math.ceil(bytes / 1000)} kB)`);
       return true;
     } catch (error) {

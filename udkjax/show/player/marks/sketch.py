@@ -9,6 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from udkjax.annotations import JsonObject
+from udkjax.show.player.marks.mark_kinds import MarkKind
 from udkjax.show.player.marks.mark_places import to_ground
 from udkjax.show.player.marks.marks import Mark
 from udkjax.show.player.marks.symbols import Symbol, symbols_of
@@ -31,6 +33,8 @@ ARROW, LONGEST_ARROW = 70.0, 3.0  # arrow of the usual force in units of symbols
 HEAD, HEAD_ANGLE, ARROW_WIDTH = 7.5, 0.42, 2.2  # head and width in units of symbols; half of the head's angle (rad)
 NOT_UNIQUE_TINT = 0.5  # fraction of the background colour mixed into the colour of a force
 STUCK = 8.0, 3.5  # radius and width, in units of symbols, of the ring around a joint that sticks
+TOUCHING, TOUCHING_TINT = "touching", 0.5  # layer of links that touch; fraction of the background mixed into their colour
+SOLID = (MarkKind.LINK, MarkKind.DISC, MarkKind.WHEEL, MarkKind.OUTLINE, MarkKind.BLOCK)  # marks of the outlines of links
 PATH_WIDTH, PATH_TINT = 1.2, 0.4  # width in units of symbols; fraction of the background colour mixed into the colour of a body
 
 
@@ -126,10 +130,13 @@ class Sketch:
         paths: Sequence[TracedPath] = (),
         arrows: Sequence[ForceArrow] = (),
         stuck: Sequence[Sequence[float]] = (),
+        touching: Sequence[JsonObject] = (),
     ):
         self.pose, self.view, self.theme = pose, view, THEMES[theme]
         symbols = symbols_of(marks, view.pt / view.scale)
         self.shapes: list[Line | Circle | Text] = [*map(self._path, paths), *map(self._shape, symbols)]
+        last = max((k for k, shape in enumerate(self.shapes) if shape.layer in SOLID), default=-1)
+        self.shapes[last + 1 : last + 1] = map(self._touching, touching)  # over the links, and below their pins
         for body, x, y in stuck:
             ring = self.anchor(body, x, y), STUCK[0] * view.pt, STUCK[1] * view.pt, self.theme["force"]
             self.shapes.append(Circle("sticking", *ring))
@@ -140,6 +147,15 @@ class Sketch:
         points = np.array([self.view.x, self.view.y]) + self.view.scale * path.points * [1, -1]
         colour = mix(self._colour(f"edge:{path.body}"), self.theme["back"], PATH_TINT)
         return Line("path", points, PATH_WIDTH * self.view.pt, colour)
+
+    def _touching(self, part: JsonObject) -> Line | Circle:
+        """Return the outline of a part of a link that touches another one."""
+        colour, radius = mix(self.theme["force"], self.theme["back"], TOUCHING_TINT), self.view.scale * part["radius"]
+        places = np.array([self.anchor(part["body"], *point) for point in part["points"]])
+        if len(places) == 1:
+            return Circle(TOUCHING, places[0], radius, fill=colour)
+        is_area = len(places) > 2
+        return Line(TOUCHING, places, 2 * radius, colour, colour if is_area else "", closed=is_area)
 
     def _arrow(self, arrow: ForceArrow) -> list[Line]:
         """Return the shaft and the head of an arrow; empty if it is too short to be seen."""
