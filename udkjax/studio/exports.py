@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from udkjax.annotations import JsonObject
-from udkjax.integrate import Solution
 from udkjax.native.language.program import UnsupportedError
 from udkjax.positions.assembling.assembly import assemble
 from udkjax.positions.assembling.channels import StateHistory
@@ -109,7 +108,7 @@ def script(mechanism: Mechanism, text: str) -> str:
     return SCRIPT.format(title=title, scene=f"(\n{lines})", duration=duration_of(mechanism), instants=INSTANTS)
 
 
-def table(mechanism: Mechanism, run: Solution) -> str:
+def table(mechanism: Mechanism, run: StateHistory) -> str:
     """Return the motion of all bodies as comma-separated values, one line per instant."""
     q = np.asarray(run.q).reshape(len(run.ts), -1)
     units = ("x (m)", "y (m)", "angle (rad)")
