@@ -8,8 +8,10 @@ from numpy.testing import assert_allclose
 from scipy.optimize import minimize_scalar
 
 import udkjax as udk
+from udkjax.positions.answers.centres import centres_table
 from udkjax.positions.answers.characteristics import acute_range
 from udkjax.positions.answers.linkage_type import four_bars, mobility
+from udkjax.statics.resting_forces import forces_table
 
 MM = {"length": "mm", "angle": "deg"}
 
@@ -54,6 +56,36 @@ def test_the_motion_of_all_pins_and_links_at_an_angle():
     text = repr(found)
     assert "at 40 deg, the angle of O-A from the x axis; at 31.4159 rad/s (300 rpm)" in text and "omega (rad/s)" in text
     assert f"{abs(expected[1]) * 1000:.6g}" in text  # mm/s
+
+
+CAM = """format = 2
+units = {length = "mm", angle = "deg"}
+ground = ["A"]
+link = [{name = "disc", pins = ["A"], mass = 1, width = 30}, {name = "follower", pins = ["B", "C"], mass = 1, width = 10}]
+slide = [{link = "follower", direction = [0, 1]}]
+cam = [{pins = ["A", "B"], profile = {base = 40, law = ["cycloidal", "cycloidal"], angle = [180, 180], lift = [24, -24]}}]
+motor = [{pin = "A", speed = "60 rpm"}]
+
+[pins]
+A = [0, 0]
+B = [0, 40]
+C = [5.51091059616e-15, 130]
+"""
+
+
+def test_rounding_is_zero_where_everything_rests_for_an_instant():
+    """At its lowest place the follower of a cycloidal cam has neither velocity nor acceleration."""
+    mechanism = udk.loads(CAM)
+    motion = udk.motion_at(mechanism, 0)
+    pins, links = motion.tables()
+    assert pins.rows == [["B", "0", "40", "0", "0", "0", "0"], ["C", "0", "130", "0", "0", "0", "0"]]
+    assert links.rows == [["disc", "0", "6.28319", "0", "1"], ["follower", "90", "0", "0", ""]]
+    centres = centres_table(mechanism, udk.kinematics(mechanism, "motor1", [0.0], rate=6.28), motion.count)
+    assert {row[0]: row[1:] for row in centres.rows}["disc and follower"] == ["0", "0"]
+    forces = forces_table(mechanism, np.asarray(mechanism.q0))
+    assert {row[0]: row[1] for row in forces.rows}["motor1 holds by"] == "0 N m"
+    moving = udk.motion_at(mechanism, [0, 30]).tables()[0].rows
+    assert float(moving[1][4]) > 1  # of B at 30 degrees, in mm/s
 
 
 @pytest.mark.parametrize("pins", [["O", "A"], ["A", "O"]])

@@ -1,6 +1,6 @@
 """The forces that hold a mechanism in a position of rest: efforts of its drivers, and forces at its pins."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import ArrayLike
@@ -54,9 +54,7 @@ def forces_table(mechanism: Mechanism, q: ArrayLike) -> PrintedTable | None:
     held = resting_forces(mechanism, q, 0.0)
     loads = [load[:2] for on in held.forces.values() for load in on.values()]
     scale = float(np.max(np.abs(loads), initial=0.0))
-    rows = [
-        [f"{name} holds by", format_number(x, mechanism.drivers[name].effort_unit), "", ""] for name, x in held.efforts.items()
-    ]
+    rows = [[f"{name} holds by", _effort(mechanism, name, x, scale), "", ""] for name, x in held.efforts.items()]
     for pin, on in held.forces.items():
         for body, (x, y, _) in on.items():
             note = "" if held.unique[pin][body] else ", not unique"
@@ -65,11 +63,17 @@ def forces_table(mechanism: Mechanism, q: ArrayLike) -> PrintedTable | None:
     return PrintedTable("forces at rest", rows, ("", "force", "x (N)", "y (N)"))
 
 
+def _effort(mechanism: Mechanism, name: str, effort: Any, scale: float) -> str:
+    """Return the effort of a driver as text; 0 if it is a rounding error beside forces of a size (N)."""
+    unit = mechanism.drivers[name].effort_unit
+    return format_number(effort, unit, scale if unit == "N" else scale * float(analyse(mechanism).length))
+
+
 def force_lines(mechanism: Mechanism, held: RestingForces) -> str:
     """Describe the forces: one line for each driver, and for each pin and body."""
     loads = [load[:2] for on in held.forces.values() for load in on.values()]
     scale = float(np.max(np.abs(loads), initial=0.0))
-    rows = [(f"{name} holds by", format_number(x, mechanism.drivers[name].effort_unit)) for name, x in held.efforts.items()]
+    rows = [(f"{name} holds by", _effort(mechanism, name, x, scale)) for name, x in held.efforts.items()]
     for pin, on in held.forces.items():
         for body, (fx, fy, _) in on.items():
             components = ", ".join(format_number(x, scale=scale) for x in (fx, fy))

@@ -64,7 +64,8 @@ def centres_table(mechanism: Mechanism, motion: Kinematics, counted: Count) -> P
     """Return the table of the instant centres of all pairs of links in the first position of a motion."""
     rows, unit, size = [], counted.units.shown("m"), counted.units.size("m")
     centres = instant_centres(mechanism, motion.q[0], motion.v[0])
-    largest = max((float(np.max(np.abs(place))) for place, at_infinity in centres.values() if not at_infinity), default=0.0)
+    finite = [float(np.max(np.abs(place))) for place, at_infinity in centres.values() if not at_infinity]
+    largest = max([float(np.max(np.abs(np.asarray(motion.q)[0, :, :2]))), *finite])
     for pair, (place, at_infinity) in centres.items():
         x, y = (format_number(z / size, scale=DRAWN / PRINTED_AS_ZERO * largest / size) for z in place)
         direction = format_number(math.degrees(math.atan2(place[1], place[0])), "deg", 360.0)

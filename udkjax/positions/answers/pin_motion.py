@@ -67,16 +67,31 @@ class PinMotion(PrintsTable):
         links = ["link", "angle (deg)", "omega (rad/s)", "alpha (rad/s²)", *(["torque ratio"] if count.is_angle else [])]
         scale = np.array([180 / np.pi, 1.0, 1.0])
         motions = {name: np.asarray(motion) / count.units.size("m") for name, motion in self.pins.items()}
-        least = [DRAWN * max([0.0, *(float(np.nanmax(np.abs(x[:, k]))) for x in motions.values())]) for k in range(3)]
-        pin_rows = {name: [_pin_row(x, least) for x in motion] for name, motion in motions.items()}
+        usual, turning = self._usual(count.is_angle)
+        largest = [max([usual[k], *(float(np.nanmax(np.abs(x[:, k]), initial=0.0)) for x in motions.values())]) for k in range(3)]
+        pin_rows = {name: [_pin_row(x, [DRAWN * y for y in largest]) for x in motion] for name, motion in motions.items()}
         link_rows: dict[str, np.ndarray] = {name: np.asarray(motion) * scale for name, motion in self.links.items()}
         if len(self.values) == 1:  # over several values, angles are continuous
             for rows in link_rows.values():
                 rows[:, 0] = 180.0 - (180.0 - rows[:, 0]) % 360.0
         if count.is_angle:  # torque out for one of the driver: power in is power out
-            ratios = {name: _ratio(np.asarray(self.rate), np.asarray(motion)[:, 1]) for name, motion in self.links.items()}
+            ratios = {name: _ratio(np.asarray(self.rate), np.asarray(motion)) for name, motion in self.links.items()}
             link_rows = {name: np.column_stack([rows, ratios[name]]) for name, rows in link_rows.items()}
-        return [self._rows(count, self.title(), heads, pin_rows), self._rows(count, "", links, link_rows)]
+        x, v, a = largest
+        first = self._rows(count, self.title(), heads, pin_rows, [x, x, v, 0.0, a, 0.0])
+        return [first, self._rows(count, "", links, link_rows, [0.0, turning, turning**2, 0.0])]
+
+    def _usual(self, is_angle: bool) -> tuple[list[float], float]:
+        """Return usual sizes of places, velocities and accelerations of pins (shown units), and of angular velocities (rad/s).
+
+        They follow from the size of the mechanism and the rate of its driver; smaller numbers by rounding are zero.
+        """
+        assert self.count is not None
+        places = [np.asarray(motion)[:, 0] for motion in self.pins.values()]
+        size = max([0.0, *(float(np.nanmax(np.abs(x), initial=0.0)) for x in places)]) / self.count.units.size("m")
+        rate = float(np.nanmax(np.abs(np.asarray(self.rate)), initial=0.0))
+        turning = rate if is_angle else rate / self.count.units.size("m") / size if size else 0.0
+        return [size, size * turning, size * turning**2], turning
 
     def counted(self, count: Count) -> "PinMotion":
         """Return the same motion, shown as values are counted."""
@@ -90,13 +105,23 @@ class PinMotion(PrintsTable):
         at = f"at {ends[0]}" if len(self.values) == 1 else f"from {ends[0]} to {ends[1]}"
         return f"{at}, {count.words}; {count.rate_text(float(self.rate[0]))}"
 
-    def _rows(self, count: Count, title: str, heads: list[str], rows: Mapping[str, TableRows]) -> PrintedTable:
-        """Return a table with a row for each name and value; the driver's values are a column if there are several."""
+    def _rows(
+        self, count: Count, title: str, heads: list[str], rows: Mapping[str, TableRows], usual: Sequence[float]
+    ) -> PrintedTable:
+        """Return a table with a row for each name and value; the driver's values are a column if there are several.
+
+        Args:
+            count: the count of the driver's values.
+            title: the title of the table.
+            heads: its heads.
+            rows: its numbers by name.
+            usual: a usual size of each column; zero where that of its numbers is one.
+        """
         many = len(self.values) > 1
         sizes = np.abs(np.array([row for motion in rows.values() for row in motion]).reshape(-1, len(heads) - 1))
-        largest = np.max(sizes, axis=0, initial=0.0, where=np.isfinite(sizes))
+        largest = np.maximum(np.max(sizes, axis=0, initial=0.0, where=np.isfinite(sizes)), usual[: len(heads) - 1])
         scales = [
-            360.0 if "deg" in head else 0.0 if "ratio" in head else DRAWN / PRINTED_AS_ZERO * x
+            360.0 if "deg" in head else None if "ratio" in head else DRAWN / PRINTED_AS_ZERO * x
             for head, x in zip(heads[1:], largest, strict=True)
         ]
         cells = [
@@ -114,13 +139,17 @@ def _pin_row(motion: Float[np.ndarray, "3 2"], least: Sequence[float]) -> list[f
     return [*place.tolist(), *sizes[0], *sizes[1]]
 
 
-def _ratio(rate: np.ndarray, omega: np.ndarray) -> np.ndarray:
-    """Return the rates of a driver and a link as a ratio, infinite where the link stands still."""
+def _ratio(rate: np.ndarray, motion: np.ndarray) -> np.ndarray:
+    """Return the rates of a driver and a link (T, 3) as a ratio: infinite where the link stands still, NaN if it never turns."""
+    omega, alpha = motion[:, 1], motion[:, 2]
     still = np.abs(omega) <= DRAWN * np.abs(rate)
-    return np.where(still, np.inf, rate / np.where(still, 1.0, omega))
+    never = np.all(still & (np.abs(alpha) <= DRAWN * rate**2))
+    return np.full_like(omega, np.nan) if never else np.where(still, np.inf, rate / np.where(still, 1.0, omega))
 
 
-def _cell(x: float, scale: float) -> str:
+def _cell(x: float, scale: float | None) -> str:
+    if scale is None:  # a ratio
+        return "" if np.isnan(x) else format_number(x)
     return format_number(x, scale=scale)
 
 
