@@ -14,6 +14,7 @@ from udkjax.positions.answers.counting import Count
 from udkjax.positions.assembling.channels import StateHistory
 from udkjax.positions.following.drive import Drive, only_driver
 from udkjax.positions.following.kinematics import Kinematics
+from udkjax.positions.gaps.convex import signed_distance
 from udkjax.positions.gaps.derivatives import differentiable_gaps
 from udkjax.positions.gaps.motion import motion_of_drive, motion_of_run
 from udkjax.positions.gaps.pairs import LinkPair, pairs_to_check
@@ -128,6 +129,23 @@ class LeastGaps(PrintsTable):
         """Return sentences, in the drawing's units, on where links touch and on how much of the range is not reached."""
         says = [f"{' and '.join(x.pair)} touch from {self._value(x.begins)} to {self._value(x.ceases)}" for x in self.contacts]
         return says + ([f"{100 * self.missing:.3g} % of the range is not reached"] if self.missing else [])
+
+    def touching(self, frames: Mapping[str, Float[np.ndarray, "3"]]) -> list[int]:
+        """Return the indices of the `parts` of links that touch, by the frames x, y, angle (m, m, rad) of links; others rest."""
+        places, of = (
+            [],
+            {name: [k for k, part in enumerate(self.parts) if part.body == name] for pair in self.pairs for name in pair.pair},
+        )
+        for part in self.parts:
+            x, y, angle = frames.get(part.body, np.zeros(3))
+            turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+            places.append((np.asarray(part.corners, float) @ turn + [x, y])[..., None])
+
+        def touch(i: int, j: int) -> bool:
+            return signed_distance(places[i], places[j])[0] <= float(self.parts[i].radius) + float(self.parts[j].radius)
+
+        pairs = [(of[one], of[other]) for one, other in (gap.pair for gap in self.pairs)]
+        return sorted({k for one, other in pairs if any(touch(i, j) for i in one for j in other) for k in (*one, *other)})
 
     def _length(self, length: Any, scale: float) -> str:
         size, unit = (1.0, "m") if self.count is None else (self.count.units.size("m"), self.count.units.shown("m"))

@@ -15,10 +15,11 @@ from udkjax.extras import WRITERS, require
 from udkjax.integrate.events.law.conditions import Gap
 from udkjax.integrate.events.law.event import ExpandsToEvents, expand_events
 from udkjax.integrate.simulate import simulate
+from udkjax.positions.gaps.gaps import LeastGaps
 from udkjax.scene.arguments import checked, require_mechanism
 from udkjax.scene.mechanism import Mechanism
 from udkjax.show.player import pictures
-from udkjax.show.player.gap_records import ShownGaps, add_gaps, touching_at
+from udkjax.show.player.gap_records import ShownGaps, add_gaps
 from udkjax.show.player.live import live_data
 from udkjax.show.player.live_parameters import Live
 from udkjax.show.player.marks.drawn_systems import PlacesBodies, drawn_system
@@ -63,8 +64,15 @@ class Animation:
         mechanisms: the mechanism of each run, whose points and links pictures name.
     """
 
-    def __init__(self, data: JsonObject, failures: Mapping[str, str] | None = None, mechanisms: Sequence[Mechanism] = ()):
+    def __init__(
+        self,
+        data: JsonObject,
+        failures: Mapping[str, str] | None = None,
+        mechanisms: Sequence[Mechanism] = (),
+        gaps: Sequence[LeastGaps | None] = (),
+    ):
         self.data, self.failures, self.mechanisms = data, dict(failures or {}), mechanisms
+        self._gaps = [*gaps] or [None] * len(data["runs"])
         self._motions = [motion_of(record) for record in data["runs"]]
         self._arrows = [arrows_of(record) for record in data["runs"]]
         self._paths: list[list[TracedPath]] | None = None
@@ -142,7 +150,13 @@ class Animation:
 
     def touching(self, t: float | None = None) -> list[list[JsonObject]]:
         """Return the outlines {body, points, radius} of the links of each run that touch at time t (s), if gaps are shown."""
-        return [touching_at(record, pose) for record, pose in zip(self.data["runs"], self.pose(t), strict=True)]
+        shown = zip(self.data["runs"], self._gaps, self.pose(t), strict=True)
+        return [
+            []
+            if found is None
+            else [run["gaps"]["parts"][k] for k in found.touching(dict(zip(run["bodies"], pose, strict=True)))]
+            for run, found, pose in shown
+        ]
 
     def labels(self) -> list[PictureLabels]:
         """Return the names of points and the lengths of links of each run."""
@@ -228,7 +242,7 @@ def animate(
     runs: dict[str, ShownMotion | None] = dict(solution) if isinstance(solution, Mapping) else {"": solution}
     if not runs:
         raise ValueError("there is no run to show")
-    records, failures = [], {}
+    records, failures, known = [], {}, []
     for label, run in runs.items():
         mech = require_mechanism(mechanism[label] if isinstance(mechanism, Mapping) else mechanism)
         run = _Still(mech) if run is None else run
@@ -236,8 +250,7 @@ def animate(
         conditions = [event.condition for event in (expand_events(events, mech) if events else ())]
         lines = [condition for condition in conditions if isinstance(condition, Gap)]
         record, poses = run_record(mech, run, label, measures, reactions, traces, shapes, lines, targets)
-        if gaps:
-            add_gaps(record, mech, run, gaps.get(label) if isinstance(gaps, Mapping) else gaps)
+        known.append(add_gaps(record, mech, run, gaps.get(label) if isinstance(gaps, Mapping) else gaps) if gaps else None)
         records.append((mech, record, poses))
         if failure := failure_of(run):
             failures[label] = failure
@@ -246,7 +259,7 @@ def animate(
     if live:
         shown: Any = [(mech, run, record) for (mech, *_), run, record in zip(records, runs.values(), data["runs"], strict=True)]
         data["live"] = live_data(shown, live, events)
-    return Animation(data, failures, [mech for mech, *_ in records])
+    return Animation(data, failures, [mech for mech, *_ in records], known)
 
 
 def _live_runs(

@@ -4,19 +4,16 @@ from collections.abc import Mapping, Sequence
 from typing import TypeAlias
 
 import numpy as np
-from jaxtyping import Float
 
 from udkjax.annotations import JsonObject
-from udkjax.positions.gaps.convex import signed_distance
 from udkjax.positions.gaps.gaps import LeastGaps, gaps
 from udkjax.scene.mechanism import Mechanism
-from udkjax.show.player.marks.mark_places import to_ground
 from udkjax.show.player.marks.measure_curves import ShownMotion
 
 ShownGaps: TypeAlias = "bool | LeastGaps | Mapping[str, LeastGaps]"
 
 
-def add_gaps(record: JsonObject, mechanism: Mechanism, run: ShownMotion, found: bool | LeastGaps | None) -> None:
+def add_gaps(record: JsonObject, mechanism: Mechanism, run: ShownMotion, found: bool | LeastGaps | None) -> LeastGaps | None:
     """Add the gaps between links to the record of a run: the least one, outlines, and events where links touch and part.
 
     Args:
@@ -25,12 +22,15 @@ def add_gaps(record: JsonObject, mechanism: Mechanism, run: ShownMotion, found: 
         run: the run.
         found: its gaps; True to find those of all pairs, False or None for a run without them.
 
+    Returns:
+        The gaps.
+
     Raises:
         ValueError: they are not those of a run.
     """
     if not isinstance(found, LeastGaps):
         if not found:
-            return
+            return None
         found = gaps(mechanism, run=run)
     over = getattr(run, "unit", "s") or "s"
     if found.unit != over:
@@ -42,19 +42,7 @@ def add_gaps(record: JsonObject, mechanism: Mechanism, run: ShownMotion, found: 
     for pair, begins, ceases in found.contacts:
         events += [{"t": t, "name": f"{' and '.join(pair)} {word}"} for t, word in ((begins, "touch"), (ceases, "part"))]
     record["events"] = sorted([*record["events"], *events], key=lambda event: event["t"])
-
-
-def touching_at(record: JsonObject, pose: Float[np.ndarray, "bodies 3"]) -> list[JsonObject]:
-    """Return the `parts` of links that touch in a pose of a run's record; none if its gaps are not shown."""
-    parts, pairs = (record.get("gaps", {}).get(key, []) for key in ("parts", "pairs"))
-    frames = [np.zeros(3) if part["body"] < 0 else pose[part["body"]] for part in parts]
-    places = [to_ground(part["points"], frame[None])[..., None] for part, frame in zip(parts, frames, strict=True)]
-
-    def touch(i: int, j: int) -> bool:
-        return float(signed_distance(places[i], places[j])[0]) <= parts[i]["radius"] + parts[j]["radius"]
-
-    found = {k for one, other in pairs for i in one for j in other if touch(i, j) for k in (*one, *other)}
-    return [parts[k] for k in sorted(found)]
+    return found
 
 
 def outlines(found: LeastGaps, bodies: Sequence[str], frames: Mapping[str, np.ndarray] | None = None) -> JsonObject:

@@ -135,7 +135,7 @@ def save_dxf(animation: Posed, path: Path, t: float | None = None, labels: bool 
     if labels:
         _label(drawing, Placing(animation.labels()[0], panels[0]), view)
     for shape in panels[0].shapes:
-        if isinstance(shape, Text) or shape.layer == TOUCHING:  # which has no lines of its own
+        if isinstance(shape, Text) or shape.layer == TOUCHING:  # an area without lines
             continue
         layer = DXF_LAYERS.get(shape.layer, f"{shape.layer}s")
         if layer not in drawing.layers:
