@@ -7,7 +7,7 @@ const page = name => import(`${process.env.STUDIO_PAGE}/${name}.js`);
 const d = await page("document"), actions = await page("actions"), {History} = await page("history"), units = await page("units");
 const {valueText, readValue} = await page("values"), view = await page("view"), picking = await page("picking"), shapes = await page("shapes");
 const clipboard = await page("clipboard"), forms = await page("pin_forms"), joining = await page("joining"), {evaluate} = await page("expressions");
-const {bars, withBar} = await page("dimensions"), {marksOf} = await page("dimension_marks"), {shapeProblem} = await page("checks"), cams = await page("cam_fields");
+const {bars, withBar, withTypedBar} = await page("dimensions"), {marksOf} = await page("dimension_marks"), {shapeProblem} = await page("checks"), cams = await page("cam_fields");
 const {symbolsOf} = await page("drawn_symbols"), {motionsOf, carry} = await page("motions"), {stateAt} = await page("player/motion"), {TOOLS} = await page("tools");
 const chart = await page("chart"), {alongOf} = await page("along");
 
@@ -740,4 +740,23 @@ test("names of kept curves are shortened to the width of the chart, and values n
     assert.ok(found.reduce((sum, words) => sum + wide(words) + 18, 0) <= room && found[1].endsWith("155.2 °"), found.join("|"));
   }
   assert.ok(chart.legendOf(curves, 500, wide)[1].startsWith("A: angl") && chart.legendOf(curves, 350, wide)[1].includes("… 155.2 °"));
+});
+
+test("a follower on a slide moves to the base circle that is typed, with its whole link, and no other follower does", () => {
+  const laws = {base: 40, law: ["cycloidal", "cycloidal"], angle: [180, 180], lift: [10, -10]}, pins = {O: [0, 0], P: [0, 40], Q: [0, 110]};
+  const cam = {...d.EMPTY, pins, ground: ["O"], link: [{name: "disc", pins: ["O"]}, {name: "follower", pins: ["P", "Q"]}], slide: [{link: "follower", direction: [0, 1]}], cam: [{pins: ["O", "P"], profile: laws}]};
+  const found = cams.withBase(freeze(cam), 0, 45);
+  assert.deepEqual(found.pins, {O: [0, 0], P: [0, 45], Q: [0, 115]});
+  assert.equal(found.cam[0].profile.base, 45);
+  const offset = cams.withBase(freeze({...cam, pins: {...pins, P: [24, 32], Q: [24, 110]}}), 0, 51);  // on its line, 24 mm from the centre
+  near([...offset.pins.P, ...offset.pins.Q], [24, 45, 24, 123]);
+  assert.deepEqual(cams.withBase(freeze({...cam, slide: []}), 0, 45).pins, pins);
+  assert.deepEqual(cams.withBase(freeze({...cam, pins: {...pins, P: [24, 32]}}), 0, 20).pins, {...pins, P: [24, 32]});  // its line does not reach the base
+});
+
+test("a bar of three pins turns as a whole, and unit vectors along an axis are exact", () => {
+  let found = {...d.EMPTY, pins: {O: [0, 0], M: [65, 0], B: [130, 0]}, ground: ["O"], link: [{name: "arm", pins: ["O", "M", "B"], mass: 1, width: 10}]};
+  found = withTypedBar(freeze(found), {...found.link[0], pins: ["O", "B"]}, "30", "angle").document;
+  near([...found.pins.M, ...found.pins.B], [65 * Math.cos(Math.PI / 6), 32.5, 130 * Math.cos(Math.PI / 6), 65]);
+  assert.deepEqual([0.5, 1, 1.5].map(k => units.unitVector(k * Math.PI)), [[0, 1], [-1, 0], [0, -1]]);
 });

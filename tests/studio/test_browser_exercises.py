@@ -54,12 +54,24 @@ class Hand:
     def field(self, label, text):
         """Click a field of the selected element, and type."""
         self.acts += 2
-        self.studio.page.get_by_label(label, exact=True).fill(text)
+        self.studio.page.locator(".properties").get_by_label(label, exact=True).fill(text)
         self.studio.page.keyboard.press("Enter")
 
     def choose(self, label, value):
         self.acts += 2
         self.studio.page.get_by_label(label, exact=True).select_option(value)
+
+    def select(self, kind):
+        """Select the first element of a kind."""
+        self.acts += 1
+        self.studio.js(f"studio.select([{{kind: '{kind}', index: 0}}])")
+
+    def tables(self):
+        """Return the rows of all tables of the answers."""
+        return self.studio.js(
+            "[...document.querySelectorAll('.answers figure')].map(one =>"
+            " [...one.querySelectorAll('tr')].map(row => [...row.children].map(cell => cell.textContent)))"
+        )
 
     def table(self, title):
         """Return the rows of a table of the answers by their first cells."""
@@ -162,21 +174,35 @@ def test_whitworths_quick_return(studio):
     hand.tool("m")
     hand.click((0, 0))
     hand.tool("v")
-    for nearest, text in ((53, "70"), (50, "60"), (150, "160"), (29, "30")):
+    hand.click((3.75, -30))
+    hand.field("x", "0")
+    for nearest, text in ((53, "70"), (50, "60"), (150, "160"), (117, "120"), (30, "32"), (30, "32")):
         hand.dimension(nearest, text)
+    hand.select("motor")
+    hand.field("speed", "90 rpm")
     found, text = hand.answers()
-    assert hand.acts <= 22
+    assert hand.acts <= 32
     kept = lengths(text)
     crank, apart = (kept[name][0] for name in ("link1", "ground"))
-    assert [crank, kept["link2"][1], kept["link3"][0]] == pytest.approx([60, 70, 160], rel=1e-9)
+    assert [crank, apart, kept["link3"][0]] == pytest.approx([60, 32, 160], rel=1e-9)
+    assert sorted(kept["link2"]) == pytest.approx([70, 120, 190], rel=1e-9)
+    places = {name: [1e3 * float(x) for x in place] for name, place in drawing(text).pins.items()}
+    assert places["F"] == pytest.approx([0, -32], abs=1e-9) and places["E"][1] == pytest.approx(-32, abs=1e-9)
     assert "turns all the way round" in found["link2"]
     slowest, _, fastest, _ = numbers(found["speed ratio of link2"])
     # The pin of the crank is farthest from the lever's, and nearest to it.
     assert [slowest, fastest] == pytest.approx([crank / (crank + apart), crank / (crank - apart)], rel=1e-5)
     # The ram's line goes through the lever's pin: it turns back where the lever lies on it.
     assert numbers(found["E"])[0] == pytest.approx(2 * 70, rel=1e-5)
-    below = math.asin(30 / crank)
+    below = math.asin(32 / crank)
     assert numbers(found["time ratio of E"])[0] == pytest.approx((math.pi + 2 * below) / (math.pi - 2 * below), rel=1e-5)
+    ends = [math.degrees(turn) % 360 for turn in (math.pi + below, -below)]  # the crank's pin is level with the lever's
+    assert numbers(found["dead points of E"]) == pytest.approx(sorted(ends), rel=1e-5)
+    # As drawn, the lever turns by v_B / |B - F| across it.
+    arm, turn = [b - f for b, f in zip(places["B"], places["F"], strict=True)], 3 * math.pi
+    omega = turn * (places["B"][0] * arm[0] + places["B"][1] * arm[1]) / (arm[0] ** 2 + arm[1] ** 2)
+    links = next(rows for rows in hand.tables() if rows[0][0] == "link")
+    assert float({row[0]: row[2] for row in links}["link2"]) == pytest.approx(omega, rel=1e-5)
 
 
 @pytest.mark.slow
@@ -199,19 +225,23 @@ def test_the_screw_of_a_scissor_jack(studio):
     hand.drag(((60, 60), (60, 30)))
     hand.field("force", "[0 N, -1000 N]")
     hand.tool("v")
-    for _ in range(4):
-        hand.dimension(50, "65")
+    for nearest, text in ((50, "65"), (50, "65"), (50, "65"), (50, "65"), (60, "80"), (60, "50")):
+        hand.dimension(nearest, text)
+    hand.select("link")
+    hand.field("angle", "40")
     _, text = hand.answers()
-    assert hand.acts <= 27
+    assert hand.acts <= 35
     kept = lengths(text)
     assert [*kept["link1"], *kept["link2"]] == pytest.approx([130, 65, 65] * 2, rel=1e-9)
+    assert sorted(kept["link3"]) == pytest.approx([50, 80, 130], rel=1e-9)
     # Virtual work: the table rises by dy while the screw shortens by dx = tan(angle) dy; the arms' middles rise half as far.
     jack = udk.loads(text)
     masses = {name: float(body.mass) for name, body in jack.bodies.items()}
     lifted = 1000 + 9.81 * (masses["link3"] + (masses["link1"] + masses["link2"]) / 2)
     foot, height = (float(drawing(text).pins[pin][axis]) for pin, axis in (("C", 0), ("D", 1)))
+    assert [foot, height] == pytest.approx([0.13 * math.cos(math.radians(40)), 0.13 * math.sin(math.radians(40))], rel=1e-8)
     screw, _, _ = hand.table("forces at rest")["motor1 holds by"]
-    assert numbers(screw)[0] == pytest.approx(-lifted * foot / height, rel=1e-5)
+    assert numbers(screw)[0] == pytest.approx(-lifted / math.tan(math.radians(40)), rel=1e-5)
 
 
 @pytest.mark.slow
@@ -251,7 +281,7 @@ def test_a_toggle_press(studio):
 
 @pytest.mark.slow
 def test_a_cam_with_a_knife_edge(studio):
-    """A cycloidal rise, a dwell and a return of a follower whose line goes through the centre of the cam."""
+    """A cycloidal rise, a dwell and a harmonic return of a follower whose line goes through the centre of the cam."""
     hand = Hand(studio)
     hand.tool("g")
     hand.click((0, 0))
@@ -266,21 +296,34 @@ def test_a_cam_with_a_knife_edge(studio):
     hand.tool("m")
     hand.click((0, 0))
     hand.tool("v")
-    studio.js("studio.select([{kind: 'cam', index: 0}])")
+    hand.select("cam")
     hand.choose("given by", "laws")
-    hand.field("lift 1", "24")
+    hand.field("base", "45")
+    hand.choose("law 3", "harmonic")
+    for field, text in (("lift 1", "30"), ("angle 1", "150"), ("angle 3", "90")):
+        hand.field(field, text)
     hand.dimension(70, "90")
+    hand.select("motor")
+    hand.field("speed", "120 rpm")
     found, text = hand.answers()
-    assert hand.acts <= 22
+    assert hand.acts <= 34
     assert lengths(text)["link1"] == pytest.approx([90], rel=1e-9)
-    assert numbers(found["link1"])[0] == pytest.approx(24, rel=1e-6)
+    places = {name: [1e3 * float(x) for x in place] for name, place in drawing(text).pins.items()}
+    assert places == {"A": [0, 0], "B": [0, 45], "C": [0, 135]}  # the follower stands on the base circle
+    assert studio.document["cam"][0]["profile"]["angle"] == [150, 30, 90, 90]
+    assert numbers(found["link1"])[0] == pytest.approx(30, rel=1e-6)
+    rise, back = math.radians(150), math.radians(90)
+    fastest = numbers(found["speed ratio of link1"])
+    assert [fastest[0], fastest[2]] == pytest.approx([-15 * math.pi / back, 60 / rise], rel=1e-5)
 
-    def slope(turn, rise=math.radians(120)):  # of the lift (mm/rad) over the distance from the centre
-        share = turn / rise
-        height = 24 * (share - math.sin(2 * math.pi * share) / (2 * math.pi))
-        return 24 / rise * (1 - math.cos(2 * math.pi * share)) / (40 + height)
+    def rising(share):  # slope of the lift (mm/rad) over the distance from the centre
+        height = 30 * (share - math.sin(2 * math.pi * share) / (2 * math.pi))
+        return 30 / rise * (1 - math.cos(2 * math.pi * share)) / (45 + height)
 
-    steepest = max(slope(math.radians(120) * k / 100_000) for k in range(100_001))
+    def falling(share):
+        return 15 * math.pi / back * math.sin(math.pi * share) / (45 + 15 * (1 + math.cos(math.pi * share)))
+
+    steepest = max(max(rising(k / 100_000), falling(k / 100_000)) for k in range(100_001))
     assert numbers(found["pressure angle of cam1"])[1] == pytest.approx(math.degrees(math.atan(steepest)), rel=1e-5)
 
 

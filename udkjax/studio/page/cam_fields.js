@@ -1,12 +1,14 @@
 // The laws of lift of a cam as fields, a row for each segment. Every change leaves a whole turn, and a follower that comes back.
 
 import {LAWS, followerDistance} from "./shapes.js";
-import {withKey} from "./document.js";
-import {angle, angleWritten, length, written} from "./units.js";
+import {list, members, shiftPins, withKey} from "./document.js";
+import {angle, angleWritten, direction, length, unitVector, written} from "./units.js";
 import {readValue, valueText} from "./values.js";
 import {make} from "./player/elements.js";
 
 const FIRST = {law: ["cycloidal", "dwell", "cycloidal", "dwell"], share: [120, 60, 120, 60], step: [1, 0, -1, 0]};  // of a new profile by laws
+
+const ROUNDS = 6, STEP = 1e-4, SAME = 1e-9;  // of Newton's method for the place of a follower; its step and error as shares of the base
 
 const stepKey = profile => (profile.swing ? "swing" : "lift");
 const stepOf = (profile, value, document) => (profile.swing ? angle : length)(value, document);
@@ -74,9 +76,22 @@ export function profileByLaws(document, cam) {
   return {base: written(base, document), law: FIRST.law, angle: FIRST.law.map((_, k) => turn(k)), lift: FIRST.law.map((_, k) => step(k))};
 }
 
+/** The drawing with another base of a cam; a follower that a slide of the ground guides moves along it until it stands on the base. */
+export function withBase(document, index, value) {
+  const cam = list(document, "cam")[index], found = withKey(document, "cam", index, "profile", {...cam.profile, base: value}), base = length(value, document);
+  const link = list(document, "link").find(({pins = []}) => pins.includes(cam.pins?.[1])), slide = list(document, "slide").find(one => one.link === link?.name && !one.on);
+  const turn = slide?.direction === undefined ? NaN : direction(slide.direction, document), [ex, ey] = unitVector(turn);
+  if (!(base > 0) || !Number.isFinite(turn) || link.pins.some(pin => members(document, pin).length > 1)) return found;
+  const at = way => shiftPins(found, link.pins, way * ex, way * ey), off = way => followerDistance(at(way), cam) - base, step = STEP * base;
+  let way = 0;
+  for (let k = 0; k < ROUNDS; k++) way -= off(way) * 2 * step / (off(way + step) - off(way - step));
+  return Math.abs(off(way)) <= SAME * base ? at(way) : found;
+}
+
 /** The fields of the profile of a cam by laws, or a choice of laws for one by points; `panel` shows them. */
 export function camFields(panel, cam, index, units) {
   const {studio: {document}} = panel, {profile = {}} = cam, segments = segmentsOf(profile, document);
+  const takeBase = value => (length(value, document) > 0 ? panel.set(withBase(document, index, value)) : panel.refuse("the base is a length above 0: write 40 or 40 mm"));
   const put = (next, why) => (next ? panel.set(withKey(document, "cam", index, "profile", next)) : panel.refuse(why));
   if (!segments) {
     if (profile.law) return [panel.field("profile", valueText(profile), "", text => put(readValue(text)))];  // lists of different lengths
@@ -104,6 +119,6 @@ export function camFields(panel, cam, index, units) {
     return make("div", {class: "segment"}, law, turn, step, away);
   });
   const head = make("div", {class: "segment head"}, make("span", {}, "law"), make("span", {}, `angle ${units.angle}`), make("span", {}, `${stepKey(profile)} ${units[units.step]}`));
-  const base = panel.field("base", valueText(profile.base), units.length, text => put({...profile, base: panel.read(text, "length")}), "");
+  const base = panel.field("base", valueText(profile.base), units.length, text => takeBase(panel.read(text, "length")), "");
   return [base, head, ...rows, make("button", {type: "button", class: "small", onclick: () => put(withSegment(profile, document))}, "Add a segment")];
 }

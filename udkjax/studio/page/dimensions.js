@@ -5,7 +5,7 @@ import {groundOf, list, movePin, nameOf, pinsOf, placeOf, settle} from "./docume
 import {fitted} from "./fitting.js";
 import {axisOf, placesOf, referencesOf} from "./pin_forms.js";
 import {barPins} from "./shapes.js";
-import {angle, direction, length, lengthName, lengthUnit, readMeasure, usesNumbers, written} from "./units.js";
+import {angle, direction, length, lengthName, lengthUnit, readMeasure, unitVector, usesNumbers, written} from "./units.js";
 
 const SAME = 1e-9;  // relative to a dimension: less is rounding of the numbers that are written
 const cross = (a, b) => a[0] * b[1] - a[1] * b[0], dot = (a, b) => a[0] * b[0] + a[1] * b[1], minus = (a, b) => [a[0] - b[0], a[1] - b[1]];
@@ -131,7 +131,7 @@ export function withBar(document, link, size, way, held = null) {
   for (const k of movers.length ? movers : [1]) {
     const [pin, anchor] = [link.pins[k], link.pins[1 - k]], from = placeOf(document, anchor), sign = k ? 1 : -1;
     if (!turns) found.push(...placed(document, link, pin, anchor, size).map(settle));
-    const moved = movePin(document, pin, [from[0] + sign * size * Math.cos(way), from[1] + sign * size * Math.sin(way)]);
+    const moved = movePin(document, pin, unitVector(way).map((x, i) => from[i] + sign * size * x));
     if (moved !== document) found.push(settle(moved));
   }
   const possible = found.filter(one => Object.keys(pinsOf(document)).every(pin => !placeOf(document, pin) || placeOf(one, pin)) && Math.abs(distance(one, ...link.pins) - size) <= 1e-6 * size);

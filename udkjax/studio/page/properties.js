@@ -11,6 +11,7 @@ import {swapPair} from "./actions.js";
 import {camFields} from "./cam_fields.js";
 import {carry} from "./motions.js";
 import {formWords, formsOf} from "./pin_forms.js";
+import {barPins} from "./shapes.js";
 import {angle, angleUnit, angleWritten, direction, expressed, length, lengthName, lengthUnit, placeFrom, readMeasure, shown, tidy, usesNumbers} from "./units.js";
 import {make} from "./player/elements.js";
 
@@ -173,17 +174,18 @@ export class PropertiesPanel {
   /** The value of an expression of named numbers, with its unit. */
   valueWords(text, quantity) { return `= ${tidy(+expressed(text, quantity, this.studio.document)?.toPrecision(6))} ${unitOf(this.studio.document, quantity)}`; }
 
-  /** Length and angle of a bar of two pins as fields, or the lengths of another link; and its mass. */
+  /** Length and angle of a bar as fields, the lengths of a bar of more than two pins and of another link; and its mass. */
   shape(link) {
     const {studio, studio: {document}} = this, {pageEngine} = studio.motion, isKnown = pageEngine && !pageEngine.scene.massless.includes(link.name), mass = isKnown ? pageEngine.masses().get(link.name) : undefined;
     const facts = [mass === undefined || link.mass !== undefined ? "" : `mass ${shown(mass, "kg")}`].filter(Boolean).map(words => make("p", {}, words));
-    const [a, b] = (link.pins ?? []).map(pin => placeOf(document, pin));
-    if (link.pins?.length !== 2 || !a || !b) return [make("p", {}, lengthsText(document, link)), ...facts];
+    const chain = barPins(document, link), ends = chain.length > 2 ? [chain[0], chain.at(-1)] : link.pins ?? [], [a, b] = ends.map(pin => placeOf(document, pin));
+    if (ends.length !== 2 || !a || !b) return [make("p", {}, lengthsText(document, link)), ...facts];
     const size = Math.hypot(b[0] - a[0], b[1] - a[1]), turn = Math.atan2(b[1] - a[1], b[0] - a[0]);
     const own = lengthOf(document, link)?.value, isNamed = usesNumbers(own, document);
-    const field = (quantity, value, unit) => this.field(quantity, value, unit, text => this.take(withTypedBar(document, link, text, quantity)));
+    const field = (quantity, value, unit) => this.field(quantity, value, unit, text => this.take(withTypedBar(document, {...link, pins: ends}, text, quantity)));
     const shownSize = isNamed ? own : tidy(+(size / lengthUnit(document)).toPrecision(9)), sizeUnit = isNamed ? this.valueWords(own, "length") : lengthName(document);
-    return [field("length", shownSize, sizeUnit), field("angle", tidy(+(turn / angleUnit(document)).toPrecision(9)), unitOf(document, "angle")), ...facts];
+    const way = field("angle", tidy(+(turn / angleUnit(document)).toPrecision(9)), unitOf(document, "angle"));
+    return chain.length > 2 ? [make("p", {}, lengthsText(document, link)), way, ...facts] : [field("length", shownSize, sizeUnit), way, ...facts];
   }
 
   /** Say where a selected pin is while the mechanism is away from its drawn position. */

@@ -104,6 +104,9 @@ export function direction(value, document) {
 /** True for a number with a unit or without one. */
 export const isMeasure = text => TEXT.test(text) && !/[-+*/^@(]/.test(text.replace(TEXT, "$2"));
 
+/** The unit vector of an angle (rad), exactly along an axis but for rounding. */
+export const unitVector = turn => [Math.cos(turn), Math.sin(turn)].map(x => (Math.abs(x) < 1e-15 ? 0 : x));
+
 export const tidy = x => +(+x).toPrecision(DIGITS) + 0;
 
 /** Metres as a number in the file's unit, or, if the old value was a string with a unit, as a string in that unit. */
