@@ -76,7 +76,7 @@ def stored(x: Any) -> Any:
 # Without `jit`, as `jax.disable_jit` has it, they convert.
 _put_together, _put_alone = jax.jit(lambda *arrays: [jnp.asarray(x) for x in arrays]), jax.jit(jnp.asarray)
 _WORTH_A_PROGRAM = 60  # calls after which a program is compiled, in 15 ms; it saves 0.3 ms per call
-_FEW_NUMBERS = 2**14  # up to which copying them into one vector takes less time than passing arrays one by one
+_FEW_NUMBERS = 2**16  # up to which copying them into one vector takes less time than passing arrays one by one
 _calls: Counter[tuple[tuple[int, ...], ...]] = Counter()  # number of calls by the shapes of the arrays
 
 

@@ -740,3 +740,28 @@ def test_each_value_adds_to_the_steps_that_continuation_may_take(monkeypatch):
     values = start + np.linspace(0.05, 1.5, 30)
     points = continuation.follow(NumpyCurve.of(driven), np.asarray(start), q, values, continuation.no_points(30, len(q), np), 0)
     assert np.all(points.status == Reached.closed)
+
+
+@pytest.mark.parametrize("ground", [2.0, 2.002], ids=["branches meet", "toggle where branches nearly meet"])
+def test_dense_values_are_followed_as_few_are(ground):
+    """Steps that are short beside the distance from dependent rows are corrected once, and keep their side of branches."""
+    joints = {
+        "A": udk.Revolute(["ground", "crank"], [[0, 0], [-0.5, 0]]),
+        "B": udk.Revolute(["crank", "coupler"], [[0.5, 0], [-1, 0]]),
+        "C": udk.Revolute(["coupler", "rocker"], [[1, 0], [0.5, 0]]),
+        "D": udk.Revolute(["ground", "rocker"], [[ground, 0], [-0.5, 0]]),
+    }
+    at = np.array([np.cos(1.0), np.sin(1.0)])
+    bodies = {
+        "crank": udk.Body(1.0, 0.1, 0.5 * at, 1.0),
+        "coupler": udk.Body(1.0, 0.1, at + [1, 0], 0.0),
+        "rocker": udk.Body(1.0, 0.1, 0.5 * at + [2, 0], 1.0),
+    }
+    scene = udk.Mechanism(bodies, joints)
+    dense = udk.kinematics(scene, "body.crank.angle", np.linspace(1.0, 8.0, 1401))
+    few = udk.kinematics(scene, "body.crank.angle", np.linspace(1.0, 8.0, 15))
+    assert np.array_equal(dense.status[::100], few.status)
+    for name in ("q", "v", "a"):
+        np.testing.assert_allclose(getattr(dense, name)[::100], getattr(few, name), rtol=1e-7, atol=1e-7)
+    np.testing.assert_allclose(dense.limit, few.limit, rtol=1e-12)
+    assert np.isinf(few.limit) == (ground == 2.0)

@@ -5,6 +5,7 @@ JAX compiles for seconds before the first step; NumPy begins at once.
 
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
+from functools import cache
 from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
@@ -102,14 +103,19 @@ def solve(function: Callable[..., Result], *arguments: Any, put: bool = True) ->
 
     NumPy's results are converted to JAX arrays, if `put`.
     """
-    leaves, tree = jax.tree.flatten(arguments, is_leaf=lambda x: isinstance(x, eqx.Module))
-    is_module = [isinstance(x, eqx.Module) for x in leaves]
+    leaves, tree = jax.tree.flatten(arguments, is_leaf=lambda x: _is_of_modules(type(x)))
+    is_module = [_is_of_modules(type(x)) for x in leaves]
     if any(_is_traced_module(x) if m else isinstance(x, Tracer) for x, m in zip(leaves, is_module, strict=True)):
         return _compiled(_by_jax, function, *arguments)
     with jax.ensure_compile_time_eval() if is_within_jit() else nullcontext(), np.errstate(all="ignore"):
         concrete = [_by_numpy(x, m) for x, m in zip(leaves, is_module, strict=True)]
         found = function(*jax.tree.unflatten(tree, concrete), BY_NUMPY)
         return put_arrays(found) if put else found
+
+
+@cache  # `isinstance` of an Equinox module takes a microsecond
+def _is_of_modules(kind: type) -> bool:
+    return issubclass(kind, eqx.Module)
 
 
 _is_traced_module = cached_by_identity(is_traced)

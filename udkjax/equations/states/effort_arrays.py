@@ -81,13 +81,15 @@ def _efforts_at(
     q, v, a = motion
     scale, share, mass = _units_of(analysis), 1 / np.sqrt(w), equations.mass[:, None]
     units, (rows, columns) = scale.coordinates, equations.entries
-    entries = equations.jacobian_entries(t, q.T) * (scale.weights[rows] * units[columns, 0])[:, None]
+    entries = equations.jacobian_entries(t, q.T)
+    entries *= (scale.weights[rows] * units[columns, 0])[:, None]
     C, (force, sizes) = slopes(q), (x.T for x in equations.force_and_sizes(t, q.T, v.T))
-    missing, pull = units * (mass * a - force), C * (share[:, None, None] * units)
+    inertia, pull = mass * units * a, C * (share[:, None, None] * units)
+    missing = inertia - units * force
     largest = np.abs(entries).max(0, initial=0.0)
     reached = np.isfinite(largest) & np.isfinite(missing).all(0) & np.isfinite(pull).all((0, 1))
     # Relative to the single terms, since their sum may be a rounding error.
-    size = np.maximum((units * (mass * np.abs(a) + sizes)).max(0), scale.inertial_load)
+    size = np.maximum((np.abs(inertia) + units * sizes).max(0), scale.inertial_load)
     rates = (C * v).sum(1)
     if not reached.all():
         pull, missing, entries, largest = (np.where(reached, x, 0.0) for x in (pull, missing, entries, largest))

@@ -6,6 +6,7 @@ memory of intermediate results does not grow with their number.
 """
 
 from collections.abc import Callable, Iterator
+from itertools import pairwise
 from typing import Any, NamedTuple, TypeAlias, TypeGuard
 
 import jax
@@ -82,7 +83,8 @@ class StateArrays:
         self.count, self.size = programs.row_count, programs.coordinate_count
         self.entries = tuple(programs.psi_q_entries[:2])  # their rows and columns
         self._in_rows = np.argsort(self.entries[0], kind="stable")
-        self._row_starts = np.flatnonzero(np.diff(self.entries[0][self._in_rows], prepend=-1))
+        ends = np.append(np.flatnonzero(np.diff(self.entries[0][self._in_rows], prepend=-1)), len(self._in_rows))
+        self._rows = [slice(*ends) for ends in pairwise(ends.tolist())]
         self.mass = np.asarray(mass_of(mechanism, np))
         self.root = 1 / np.sqrt(self.mass)
         self._weight = self.mass * np.tile([*np.asarray(mechanism.gravity, float), 0.0], self.size // 3)
@@ -136,7 +138,8 @@ class StateArrays:
 
     def largest_row(self, entries: np.ndarray) -> np.ndarray:
         """Return the largest absolute sum (T,) of the entries (entries, T) of a row."""
-        return np.abs(np.add.reduceat(entries[self._in_rows], self._row_starts, 0)).max(0)
+        ordered = entries[self._in_rows]
+        return np.abs([ordered[row].sum(0) for row in self._rows]).max(0)
 
     def dense(self, entries: np.ndarray) -> np.ndarray:
         """Return matrices (T, m, n) from their entries (entries, T)."""

@@ -81,15 +81,15 @@ def drive(mechanism: Mechanism, driver: Drive, t: NumberLike = 0.0, held: Mappin
     refuse_rolling(mechanism, "positions do not follow from a driver")
     if not mechanism.is_concrete or is_traced((driver, t, held)):
         return _drive(mechanism, driver, t, held)
-    with jax.ensure_compile_time_eval():  # concrete even while something else is traced
-        pairs = [(name, np.asarray(value, float).item()) for name, value in (held or {}).items()]
-        return _drive_concrete(mechanism, driver, np.asarray(t, float).item(), *itertools.chain(*pairs))
+    pairs = [(name, np.asarray(value, float).item()) for name, value in (held or {}).items()]
+    return _drive_concrete(mechanism, driver, np.asarray(t, float).item(), *itertools.chain(*pairs))
 
 
 @cached_by_identity
 def _drive_concrete(mechanism: Mechanism, driver: Drive, t: float, *held: Any) -> Driven:
     """Return the driven mechanism; `held` has names and values in turn, which the cache compares by value."""
-    return _drive(mechanism, driver, t, dict(zip(held[::2], held[1::2], strict=True)))
+    with jax.ensure_compile_time_eval():  # concrete even while something else is traced
+        return _drive(mechanism, driver, t, dict(zip(held[::2], held[1::2], strict=True)))
 
 
 def _drive(mechanism: Mechanism, driver: Drive, t: NumberLike, held: Mapping[str, NumberLike] | None) -> Driven:

@@ -382,6 +382,8 @@ def _count_on_branch(
         is_same_side = march_result.side == march_result.first_side
         return jnp.sum(jnp.cumprod(is_same_side & (np.arange(len(values)) < march_result.trusted)))
     trusted = int(march_result.trusted)
+    if (march_result.side[:trusted] == march_result.first_side).all():
+        return trusted
     previous_sides = np.append(march_result.first_side, march_result.side[:-1])
     for k in np.flatnonzero(march_result.side[:trusted] != previous_sides[:trusted]).tolist():
         s, q = (values[k - 1], march_result.q[k - 1]) if k else (s, q)
