@@ -765,3 +765,7 @@ def test_dense_values_are_followed_as_few_are(ground):
         np.testing.assert_allclose(getattr(dense, name)[::100], getattr(few, name), rtol=1e-7, atol=1e-7)
     np.testing.assert_allclose(dense.limit, few.limit, rtol=1e-12)
     assert np.isinf(few.limit) == (ground == 2.0)
+    driven, q = drive(scene, "body.crank.angle"), scene.q0.ravel()
+    found = march_at_once(driven.mechanism, driven.analysis, driven.unit, 1.0, q, np.linspace(2.5, 3.6, 7))
+    assert found.trusted < 7 or set(found.side.tolist()) == {1.0, -1.0}  # it changes where branches meet, in a long step
+    assert (found.trusted == 7) == (ground == 2.0)
