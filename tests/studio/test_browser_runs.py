@@ -52,3 +52,31 @@ def test_a_long_run_is_stopped_by_a_button(studio):
     assert "stopped at" in studio.page.locator(".loops").inner_text()
     assert 0 < studio.js("studio.motion.end / studio.motion.pageEngine.scene.duration") < 1
     assert not studio.page.get_by_role("button", name="stop computing").is_visible()
+
+
+@pytest.mark.slow
+def test_slow_diagnoses_of_outdated_drawings_are_left_out(studio):
+    """A browser has six connections to a server: diagnoses that wait for each other must not keep the motion waiting."""
+    pending, asked, is_held = [], [], [True]
+
+    def hold(route):
+        asked.append(route.request.post_data_json)
+        if is_held[0]:
+            pending.append(route)
+        else:
+            route.continue_()
+
+    studio.page.route("**/api/diagnose", hold)
+    studio.js("studio.files.openTemplate('crank_rocker')")
+    studio.until("studio.motion.run?.count > 1")
+    for k in range(8):
+        studio.js(f"studio.commit({{...studio.document, name: 'drawing {k}'}})")
+        studio.until("studio.motion.run?.count > 1")
+        studio.page.wait_for_timeout(450)  # until this drawing would be diagnosed
+    assert len(pending) == 1
+    is_held[0] = False
+    pending[0].continue_()
+    studio.settle()
+    assert "drawing 7" not in asked[0]["text"] and all("drawing 7" in one["text"] for one in asked[1:])
+    assert "1 degree of freedom" in studio.findings
+    assert studio.js("studio.answers.text").count("drawing 7") == 1

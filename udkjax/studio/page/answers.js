@@ -1,7 +1,6 @@
 // The answers that a course asks for: type, mobility, strokes, dead points, ratios; and tables of pins, links and instant centres at
 // the position shown. The server computes them, by the functions of the command line.
 
-import {ask} from "./api.js";
 import {alongOf, turningMotors} from "./along.js";
 import {GapsPanel} from "./gaps.js";
 import {make} from "./player/elements.js";
@@ -31,7 +30,7 @@ export class AnswersPanel {
 
   /** Ask for the answers of the drawing that a text describes. */
   async follow(text, isLate) {
-    const at = this.position(), found = await ask("diagnose", {text, about: "answers", ...(at ? {end: {at}} : {})});
+    const at = this.position(), found = await this.studio.sync.examine({text, about: "answers", ...(at ? {end: {at}} : {})}, isLate);
     if (isLate()) return;
     if (text !== this.gaps.text) this.gaps.clear(found.answers?.length ? text : null);
     Object.assign(this, {text, last: at});

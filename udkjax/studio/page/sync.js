@@ -14,7 +14,14 @@ const structureOf = ({pins, ...rest}) => JSON.stringify([Object.keys(pins ?? {})
 
 export class Sync {
   constructor(studio) {
-    Object.assign(this, {studio, stamp: 0, structure: null, engines: new Map(), pending: Promise.resolve()});
+    Object.assign(this, {studio, stamp: 0, structure: null, engines: new Map(), pending: Promise.resolve(), turn: Promise.resolve()});
+  }
+
+  /** Ask for a diagnosis once former ones are answered, lest they take all connections of the browser; null if `isLate` by then. */
+  examine(request, isLate) {
+    const answer = this.turn.then(() => (isLate() ? null : ask("diagnose", request)));
+    this.turn = answer.catch(() => {});
+    return answer;
   }
 
   /** Update everything for the current state; `settled` waits for it. */
@@ -108,17 +115,17 @@ export class Sync {
     await motion.settled();
     const {unexplained: end, run} = motion;
     if (isLate() || !end) return;
-    const {cause} = await ask("diagnose", {text, about: "end", end});
-    if (!isLate()) motion.explain(run, cause);
+    const found = await this.examine({text, about: "end", end}, isLate);
+    if (!isLate()) motion.explain(run, found.cause);
   }
 
   async diagnose(text, isLate) {
-    const {studio} = this, found = await ask("diagnose", {text});
+    const {studio} = this, found = await this.examine({text}, isLate);
     if (isLate()) return undefined;
     studio.findings.showStructure(found);
     studio.motion.explain(studio.motion.run, found.conflict);
     if (found.problems.length || !studio.motion.pageEngine?.scene.drivers.length) return studio.answers.clear();
-    const travel = await ask("diagnose", {text, about: "travel"});
+    const travel = await this.examine({text, about: "travel"}, isLate);
     if (isLate()) return undefined;
     studio.findings.showTravel(travel);
     return studio.answers.follow(text, isLate);
