@@ -315,3 +315,11 @@ def test_a_mechanism_with_a_drawing_passes_through_jit():
     mass = jax.jit(lambda m, x: m.with_parameters({"link.coupler.density": x}).bodies["coupler"].mass)
     assert_allclose(mass(mech, 2000.0), 2 * mech.bodies["coupler"].mass, rtol=1e-15)
     assert udk.analyse(mech).degrees_of_freedom == 1 and mech.without_origin.drawing is None
+
+
+@pytest.mark.filterwarnings("error")
+def test_choices_may_be_strings_of_numpy():
+    pins = {"O": (0.0, 0.0), "C": (2.0, 0.0), "A": (0.0, 1.0), "B": udk.circles(("A", "C"), (2.0, 2.0), np.array(["left", "right"])[0])}
+    links = {"crank": {"pins": ["O", "A"]}, "coupler": {"pins": ["A", "B"]}, "rocker": {"pins": ["C", "B"]}}
+    mech = udk.Drawing(pins, links, ground=["O", "C"]).mechanism()
+    assert mech.with_parameters({"pin.B.length": [2.1, 2.0]}).q0.shape == (3, 3)

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple, Union, cast, get_args, get_origin
 
 import equinox as eqx
 import jax
+import numpy as np
 
 from udkjax.scene.elements import couplings, drivers, forces, friction, joints, rolling
 from udkjax.scene.elements.bodies import Body
@@ -102,7 +103,9 @@ def _optional_keys(cls: type) -> frozenset[str]:
 def build(annotation: Any, value: object) -> Any:
     """Make an element, including nested modules, from a checked table."""
     if not isinstance(value, dict):
-        return value
+        return (
+            str(value) if isinstance(value, np.str_) else value
+        )  # NumPy's strings count as arrays, as when one is chosen at random
     if get_origin(annotation) is types.UnionType:  # a number, or samples of it
         annotation = get_args(annotation)[1]
     annotation = profile_class(value) if annotation is AbstractProfile else annotation
