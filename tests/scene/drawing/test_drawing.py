@@ -319,7 +319,12 @@ def test_a_mechanism_with_a_drawing_passes_through_jit():
 
 @pytest.mark.filterwarnings("error")
 def test_choices_may_be_strings_of_numpy():
-    pins = {"O": (0.0, 0.0), "C": (2.0, 0.0), "A": (0.0, 1.0), "B": udk.circles(("A", "C"), (2.0, 2.0), np.array(["left", "right"])[0])}
+    pins = {
+        "O": (0.0, 0.0),
+        "C": (2.0, 0.0),
+        "A": (0.0, 1.0),
+        "B": udk.circles(("A", "C"), (2.0, 2.0), np.array(["left", "right"])[0]),
+    }
     links = {"crank": {"pins": ["O", "A"]}, "coupler": {"pins": ["A", "B"]}, "rocker": {"pins": ["C", "B"]}}
     mech = udk.Drawing(pins, links, ground=["O", "C"]).mechanism()
     assert mech.with_parameters({"pin.B.length": [2.1, 2.0]}).q0.shape == (3, 3)

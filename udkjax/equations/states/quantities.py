@@ -222,7 +222,7 @@ def efforts(
 
     Args:
         mechanism: The scene.
-        solution: Times and states: anything with ts (T,), q and v (T, bodies, 3).
+        solution: Times and states: anything with ts (T,), q and v (T, bodies, 3); a `Kinematics` as for `reactions`.
         method: The pseudoinverse; by default `SVD`. A redundant driver gets its share of the minimum-norm multipliers.
         stabilization: The run's `Baumgarte`, to include its terms.
 

@@ -56,7 +56,8 @@ def reactions(
 
     Args:
         mechanism: the mechanism, or a `ConstrainedSystem`.
-        solution: anything with ts (T,), q and v (T, bodies, 3).
+        solution: anything with ts (T,), q and v (T, bodies, 3). Along a `Kinematics` over the values of a driver, this driver
+            has its rate and acceleration, all others are at rest, and time is zero.
         method: the pseudoinverse; by default `SVD`.
         stabilization: the run's `Baumgarte`, to include its terms.
         frame: the axes of the force. "ground"; "body": those of the loaded body; "joint": x along the `axis` of a joint, or
