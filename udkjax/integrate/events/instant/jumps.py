@@ -116,7 +116,7 @@ def _apply_event(
         return JumpResult(state, None, _code(blocked, xp)), None
 
     free, held = state._replace(phase=plan.free(after)), plan.held(phase, xp)
-    is_evaluated = xp is np and not plan.adds.any() and np.array_equal(free.phase, phase)
+    is_evaluated = xp is np and v is before.v and np.array_equal(free.phase, phase)
     state_values = state_values if is_evaluated else system.look(members, free, is_free=True)
     if not plan.has_bodies:
         rows = rows_of_mobilities(state_values.by_q, state_values.directions, state_values.mobilities)

@@ -39,7 +39,7 @@ class PhasePlan(NamedTuple):
     states: EvaluateEvents
     marking: MarkRows | None  # marks independent rows; None if this is not needed
     projected: bool
-    project: StateOperation | None  # projects to the joints that events add; None without any
+    project: StateOperation  # of states whose velocities an event has changed; compiled by its first call
     joints: tuple[tuple[int, ...], ...]  # places of the numbers of each such joint, then of the sides of comparisons
     active: tuple[tuple[int, int], ...]  # places of the numbers that switch constraints on, each with the index of the switch
     sides_of_events: tuple[tuple[int, int], ...]  # places of sides among the numbers of events, with the index of the side
@@ -97,7 +97,7 @@ def phase_plan(
         states=run.accelerations.of_events(conditions if has_forces else without, directed),
         marking=_marking(compiled.textbook) if run.code.marks_rows and not run.code.weighs_rows else None,
         projected=compiled.plan.projected,
-        project=run.accelerations.jump if added else None,
+        project=run.accelerations.jump,
         joints=(*joints, sides),
         active=active,
         sides_of_events=of_kinks.sides,
@@ -182,7 +182,8 @@ class PhaseCode:
         self._places_of_joints = places[self._columns]
         self._of_switches = np.array(plan.active, int).reshape(-1, 2).T
         self._run, self._evaluate = MemberCalls(plan.run), MemberCalls(plan.states).at_states
-        self._mark_rows, self._project = (x and MemberCalls(x).at_states for x in (plan.marking, plan.project))
+        self._mark_rows = plan.marking and MemberCalls(plan.marking).at_states
+        self._project = MemberCalls(plan.project).at_states
         self._seen: tuple[bytes, ...] = ()  # the states that were evaluated last, and their values
         self._values: StateValues | None = None
         self._marks: dict[bytes, np.ndarray] = {}  # by the phase, of all members; NaN: not known yet
@@ -277,7 +278,6 @@ class PhaseCode:
         """Return positions and velocities of members, projected to the constraints of their phases, and what rates are left."""
         t, q, v, *_ = state
         n = q.shape[1]
-        assert self._project is not None  # events add joints
         further = _of(self._of_states, members), _of(self._rows, members), np.zeros((1, 0))
         numbers = self._with_samples(members, t, self._with_marks(members, state))
         (results,) = self._project(numbers, np.stack([t, t], axis=1), q, v, *further)
