@@ -23,7 +23,7 @@ def refusal(folder: Path) -> str | None:
 
 
 def distrust(status: os.stat_result) -> str | None:
-    """Return why the content of a file or folder may be that of others; None if it is not."""
+    """Return why other users may have written a file or folder; None if they cannot."""
     if not hasattr(os, "getuid"):  # Windows: the user's own folders are closed to others by default
         return None
     if status.st_uid not in (os.getuid(), 0):

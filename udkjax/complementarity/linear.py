@@ -156,7 +156,7 @@ def _lemke(M: Float[Any, "n n"], q: Float[Any, "n"], xp: ModuleType) -> tuple[Bo
 def eliminate(
     W: Float[Any, "*m E E"], rows: Bool[Any, "*m E"], least: Float[Any, "*m E"], xp: ModuleType = jnp
 ) -> tuple[Float[Any, "*m E E"], Bool[Any, "*m E"]]:
-    """Return the remainder of W when given rows are held, and a mask of those that are independent.
+    """Return the Schur complement of W after the given rows are eliminated, and a mask of the independent rows among these.
 
     Args:
         W: symmetric, and positive semidefinite.

@@ -53,41 +53,42 @@ class RubbingContacts(NamedTuple):
     """Contacts in an impact: N, F of which have friction. Rows are normal ones first; units are those in which W_ii = 1."""
 
     W: Float[Any, "*m R R"]
-    y: Float[Any, "*m R"]  # before
+    y: Float[Any, "*m R"]  # speeds before the impact
     restitution: Float[Any, "*m N"]
     friction: Float[Any, "*m F"]
     takes_part: Bool[Any, "*m N"]
 
 
 class _Progress(NamedTuple):
-    """An impact at one instant."""
+    """State of an impact of N contacts, F of them with friction, at one value of s; R = N + F rows."""
 
-    x: Any  # (R,)
-    y: Any  # (R,)
-    slides: Any  # (F,): the direction; 0: at rest
-    approach: Any  # (N,): c; 0 in the expansion
-    least: Any  # (N,): e L; 0 in the compression
-    remains: Any  # of the phase, from one to zero
-    work: Any  # of the impulses so far
-    parts: Any  # of the phase so far
+    x: Any  # (R,): impulses
+    y: Any  # (R,): speeds
+    slides: Any  # (F,): direction of sliding, -1 or 1; 0: at rest
+    approach: Any  # (N,): approach speed c; 0 in the expansion
+    least: Any  # (N,): least impulse e L; 0 in the compression
+    remains: Any  # 1 - s, the remaining fraction of the phase
+    work: Any  # work of the impulses so far
+    parts: Any  # number of parts of the phase so far
     at_once: Any  # whether the rest of the phase is one problem
-    expands: Any  # whether it is the second phase
+    expands: Any  # whether the phase is the expansion
     done: Any
 
 
 class _ImpactLaw(NamedTuple):
-    """The contacts of one impact, and the tolerances."""
+    """Data of one impact of N contacts, F of them with friction; R = N + F rows."""
 
-    W: Any
-    friction: Any
-    restitution: Any
-    takes_part: Any
+    W: Any  # (R, R): mobilities
+    friction: Any  # (F,): coefficients mu
+    restitution: Any  # (N,): coefficients e
+    takes_part: Any  # (N,): whether the contact is closed
     of_rows: Any  # (F,): the contact of each row along a line
     zero: Any  # speed that counts as zero
     xp: ModuleType
 
     @property
     def rubs(self) -> Any:
+        """Mask of the rows along lines that have friction and whose contact is closed (F,)."""
         return self.takes_part[self.of_rows] & (self.friction > 0)
 
 

@@ -69,7 +69,7 @@ AT_REST = RestTolerances()
 
 
 class Response(NamedTuple):
-    """The motion of the joints in given modes, and their forces."""
+    """Response of F joints to given modes: their accelerations, and the margins between their friction forces and the limits."""
 
     accelerations: Float[Any, "*m F"]  # along the joints
     forwards: Float[Any, "*m F"]  # limits minus forces in the positive direction
@@ -79,7 +79,7 @@ class Response(NamedTuple):
 
 
 class ContactsAtRest(NamedTuple):
-    """The contacts at one instant, E, which may be those of joints."""
+    """Contacts (E) at one instant; some of them belong to joints that rub in them."""
 
     of_joints: Int[np.ndarray, "F"]  # the contact of each joint; -1: it is no contact
     held: Bool[Any, "*m E"]  # at first
@@ -89,7 +89,7 @@ class ContactsAtRest(NamedTuple):
 
     @classmethod
     def none(cls, count: int) -> "ContactsAtRest":
-        """Return no contacts, beside `count` joints."""
+        """Return the record without contacts, for `count` joints."""
         nothing = NO_CONTACTS.astype(bool)
         return cls(np.full(count, -1), nothing, nothing, NO_CONTACTS, 0)
 
@@ -113,7 +113,7 @@ class ContactsAtRest(NamedTuple):
 
 
 class FrictionModes(NamedTuple):
-    """The modes of joints that may stick."""
+    """Modes of F joints with set-valued friction (locked, sliding or kept at rest by others), and of E contacts."""
 
     locked: Bool[Any, "*m F"]
     direction: Float[Any, "*m F"]  # of sliding, or of the limit that is reached; 0: within the limit
@@ -128,7 +128,7 @@ class FrictionModes(NamedTuple):
 
 
 class Decision(NamedTuple):
-    """The modes that joints have."""
+    """Result of the search for modes that obey the friction law."""
 
     modes: FrictionModes
     failed: Bool[Any, "*m"]  # whether no modes were found that obey the law
@@ -148,7 +148,7 @@ class _Pivot(NamedTuple):
 
 
 class JointsAtRest(NamedTuple):
-    """The joints at one instant, those at rest among them."""
+    """State of F joints with set-valued friction at one instant, and the mobilities W that decide which of them stick."""
 
     rest: Bool[Any, "*m F"]  # whether their speeds are zero
     sliding: Float[Any, "*m F"]  # the directions of all others

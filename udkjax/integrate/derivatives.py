@@ -177,7 +177,7 @@ class DifferentiableRun(DifferentiableFunction):
         return integrate_by_diffrax(self.problem(inputs)), ()
 
     def _own(self, inputs: list[Array], raw: IntegratorOutput) -> IntegratorOutput:
-        """Return the output of a run, given that of the run that has its derivatives."""
+        """Return the output of a run by its own formulation; `raw` is that of the run whose derivatives it has."""
         operation = self.problem.rest.compiled.plan.operation
         return self.fast(inputs) if operation is not None and operation.closes else raw
 

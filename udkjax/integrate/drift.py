@@ -62,7 +62,7 @@ def _rank_near_start(problem: Problem, equations: TextbookEquations) -> Float[Ar
 
 
 class DriftState(NamedTuple):
-    """The state of a `DriftController`."""
+    """State of a `DriftController`: that of the wrapped controller, the largest distance so far, and the status."""
 
     inner: PyTree
     farthest: Float[Array, ""]  # largest distance from singular configurations so far

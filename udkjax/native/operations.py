@@ -125,7 +125,7 @@ class Operation(ABC):
 
 @dataclass(frozen=True)
 class StateOperation(Operation):
-    """A function of single states."""
+    """An operation that is evaluated at single states, without integration."""
 
     pseudoinverse: DenseMethod | None = None  # None: elimination
     formulation: FormulationCode | None = None  # None: the Udwadia-Kalaba equation

@@ -103,7 +103,8 @@ def _wait_for(calls: Sequence[Future[Any]]) -> None:
 class LoadedCode:
     """The machine code of one operation in `width` lanes.
 
-    Where a run leaves the module, the code of the later operation is loaded at the same level, and called directly from then on.
+    If members leave for the module of a later operation, its code is loaded at the same level of optimization, and called directly
+    from then on.
     First calls use quickly compiled code, which runs slowly: only calls with few members and steps, and only until they have
     taken a tenth of the time of compiling optimized code. Both codes round equally.
     """
@@ -141,7 +142,7 @@ class LoadedCode:
         return host_handler.register(self.name, self._optimized.library["call_frame"])
 
     def code(self, level: int) -> Code:
-        """Return the code of a level."""
+        """Return the code of a level of optimization, compiled at its first use."""
         return self._optimized if level == machine.LEVEL else self._quick
 
     @cached_property
@@ -173,7 +174,7 @@ class LoadedCode:
         return not isinstance(self._operation, RunCotangents) or not goes_back(inputs) or records.are_given(inputs)
 
     def _call_quickly(self, inputs: Sequence[np.ndarray], shapes: Sequence[tuple[int, ...]]) -> list[np.ndarray] | None:
-        """Return the outputs; None if there are too many steps."""
+        """Return the outputs, computed by quickly compiled code; None if a run exceeds its share of `QUICK_STEPS` steps."""
         inputs, allowed, column = [*inputs], QUICK_STEPS / shapes[0][0], self._step_limit
         if column is not None:
             k = INPUTS.index("settings")

@@ -118,7 +118,7 @@ class RunStates(Operation):
 
     @property
     def _for_derivatives(self) -> dict[str, Any]:
-        """The fields of the same operation with derivatives, which are those of another run if this one `closes`."""
+        """The fields of this operation when it is differentiated; without the formulation if this `closes`."""
         changed = {"code": self.code.for_derivatives} | ({"formulation": None} if self.closes else {})
         return {item.name: getattr(self, item.name) for item in fields(self)} | changed
 

@@ -154,7 +154,7 @@ class ConcreteLeaf:
 
 
 class _StaticPart:
-    """The part of a result that is not traced, and not part of a program."""
+    """The static part of a result: everything in it that is not a traced array."""
 
     def __init__(self, value: Any):
         self.value = value

@@ -274,7 +274,7 @@ class Mechanism(PrintsTable, Model, ConvertsItself):
 
     @property
     def without_origin(self) -> "Mechanism":
-        """The mechanism of its elements alone, without `origin` and `drawing`: programs are shared by all that agree in these.
+        """The mechanism of its elements alone, without `origin` and `drawing`; mechanisms with equal elements share programs.
 
         All numbers of the equations are leaves of it, also those that follow from others.
         """
@@ -289,7 +289,7 @@ class Mechanism(PrintsTable, Model, ConvertsItself):
         return self if self.origin is None else _copy(self, {"origin": None})
 
     def know_elements(self, known: "Mechanism") -> None:
-        """Take for `without_origin` what it returned for the same numbers, so that a program does not compute it again."""
+        """Store the result of `without_origin` for the same numbers, so that a program does not compute it again."""
         elements_of.know(self._source, known._source.elements)
         _without_origin.know(self, known)
 

@@ -57,7 +57,7 @@ def channels_figure(
 
 
 def _tick_turns(axes: Axes, label: str) -> None:
-    """Put the ticks of an axis of degrees, as its label says, at parts of a turn."""
+    """Place ticks at fractions of a turn if the label says that the axis is in degrees."""
     if label.endswith("(deg)"):
         axes.xaxis.set_major_locator(MaxNLocator(9, steps=[1, 1.5, 3, 4.5, 9, 10]))
 

@@ -138,7 +138,7 @@ def structure(mechanism: Mechanism, text: str) -> JsonObject:
 
 
 def _conflict(mechanism: Mechanism) -> str:
-    """Return why no velocities satisfy all constraints as drawn, with the names of the motors; empty if there are some."""
+    """Return why no velocities satisfy all constraints as drawn, with the names of the motors; empty if some velocities do."""
     try:
         assemble(mechanism)
     except AssemblyError as error:

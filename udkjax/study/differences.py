@@ -129,7 +129,7 @@ class DifferenceSums:
 
 
 def _truncation(distances: Float[np.ndarray, "H H S"], noise: Float[np.ndarray, "H S"]) -> Float[np.ndarray, "H-1 S"]:
-    """Return the truncation error at all steps except the last, from distances |R(h) - R(h')|; those to itself are sizes."""
+    """Return the truncation error at all steps but the last, from distances |R(h) - R(h')|, with sizes |R(h)| on the diagonal."""
     count = len(noise) - 1
     error = np.full((count, noise.shape[1]), np.nan)
     for k in reversed(range(count)):

@@ -19,13 +19,13 @@ class NeededTolerances(NamedTuple):
 
 @cache
 def needed_tolerances() -> tuple[NeededTolerances, ...]:
-    """Return the mechanisms of the atlas."""
+    """Return the tolerances that each mechanism of the atlas needed."""
     text = (files("udkjax.study") / "atlas.json").read_text(encoding="utf-8")
     return tuple(NeededTolerances(**entry) for entry in json.loads(text))
 
 
 def tolerance_lines(name: str) -> list[str]:
-    """Return, for each error, the range of tolerances that all mechanisms needed, and what those of this name needed."""
+    """Return, for each error, the range of tolerances that all mechanisms needed, and those that mechanisms of this name needed."""
     table = needed_tolerances()
     errors = list(dict.fromkeys(error for one in table for error in one.tolerances))
     lines = []

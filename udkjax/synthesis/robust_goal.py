@@ -96,7 +96,7 @@ class RobustGoal(MotionTerm):
 
 
 class MadePieces:
-    """MadePieces of a mechanism by free numbers x (P,) and independent deviations u (K,) of unit variance, x before u.
+    """A mechanism as made: a function of free numbers x (P,) and deviations u (K,) of unit variance; vectors hold x before u.
 
     Args:
         free: the free numbers.

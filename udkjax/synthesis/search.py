@@ -47,7 +47,7 @@ class SearchState:
     kept_loss: np.ndarray
 
     def take(self, which: np.ndarray) -> "SearchState":
-        """Return some of the trials."""
+        """Return the selected trials."""
         arrays = ((field.name, getattr(self, field.name)) for field in fields(self))
         selected: dict[str, Any] = {name: a[which] if isinstance(a, np.ndarray) else a.take(which) for name, a in arrays}
         return SearchState(**selected)

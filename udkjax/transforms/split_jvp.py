@@ -61,7 +61,7 @@ class SplitForms:
         self.values = len(shapes[0])
 
     def mapped(self, axes: Sequence[int | None], size: int) -> "SplitForms":
-        """Return both forms for a batch."""
+        """Return both forms, batched along the given axes of the arrays, for `size` members."""
         seen, run = (jax.vmap(f, in_axes=tuple(axes), axis_size=size) for f in (self.seen, self.run))
         value, change = ([jax.ShapeDtypeStruct((size, *x.shape), x.dtype) for x in part] for part in self.shapes)
         direction_types = [

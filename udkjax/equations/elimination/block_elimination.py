@@ -82,7 +82,7 @@ class BlockElimination:
         yield from self.terms.jt(solve)
 
     def substitute(self, solve: int, **names: str) -> ProgramParts:
-        """Compute x = (Psi_q M^(-1) Psi_q^T)^(-1) right; `names` are those of arrays that differ from the system's."""
+        """Compute x = (Psi_q M^(-1) Psi_q^T)^(-1) right; `names` renames arrays of the system, such as x="x2"."""
         yield from FACTORS.substitute(self.terms, self.order, self._front_table, solve, **names)
 
     def safe(self) -> KernelLoop:

@@ -101,7 +101,7 @@ class FrictionElimination:
         yield from self._finish(solve, v, reports=True, in_part=True)
 
     def settled(self, solve: int, v: str = "v") -> ProgramParts:
-        """Compute the results of `settle` where x = `settled` is the solution, by one round: its factors are those there."""
+        """Compute the results of `settle` by one round that starts at its solution `settled`, with the factors there."""
         yield from self._begin_at_settled(solve)
         yield from self._round(solve, v)
         yield from self._finish(solve, v, reports=False)
@@ -139,7 +139,7 @@ class FrictionElimination:
         yield from self._jt(solve, checked=True)
 
     def _copy_solution(self, source: str, to: str, if_small: bool = False) -> ProgramParts:
-        """Copy the x of all rows; with `if_small` only if the last correction left little of the rest."""
+        """Copy the x of all rows; with `if_small` only if the last correction left a small fraction of the residual."""
         for group in self.terms.layout.eliminated:
 
             def write(w: KernelWriter, group: ConstraintGroup = group):

@@ -38,15 +38,15 @@ class FrontFactors(NamedTuple):
 
     @property
     def columns(self) -> int:
-        """The number of columns of the table for a later block, and of those before the first one."""
+        """Columns per later block in the table of fronts; as many precede those of the first later block."""
         return 2 if self.is_symmetric else 3
 
     def below(self, a: int) -> int:
-        """Return the column of the part of L of the later block a."""
+        """Return the table's column for the block of L that couples the later block a."""
         return self.columns * (a + 1)
 
     def beside(self, a: int) -> int:
-        """Return the column of the part of U of the later block a."""
+        """Return the table's column for the block of U that couples the later block a."""
         return self.below(a) + (0 if self.is_symmetric else 1)
 
     def right(self, a: int) -> int:
@@ -56,7 +56,7 @@ class FrontFactors(NamedTuple):
     def substitute(
         self, terms: SceneTerms, order: list[Fronts], table: Callable[[Fronts], np.ndarray], solve: int, **names: str
     ) -> ProgramParts:
-        """Compute x of the system `solve` from its right-hand side; `names` are those of arrays that differ from the system's."""
+        """Compute x of the system `solve` from its right-hand side; `names` renames arrays of the system, such as x="x2"."""
         names = arrays_of_solve(solve) | names
         yield Reset(names["sum"], 0, terms.layout.sizes[names["sum"]])
         for fronts in order:

@@ -146,7 +146,7 @@ class LoadSharing:
         yield loop._replace(fixed=tuple(self._solutions))
 
     def share(self, solve: int, null: str = "null") -> ProgramParts:
-        """Compute `loads`, the x of all rows, from the solution x_e of a linear system."""
+        """Compute `loads`, x of all rows with the shares of redundant rows, from the solution x_e of the eliminated system."""
         if not self._count:
             return
         k, names = self._count, {"sums": f"sums{solve}", "loads": f"loads{solve}", "x": f"x{solve}", "null": null}

@@ -52,7 +52,7 @@ class SkewElimination:
         yield from self._factors
 
     def substitute(self, solve: int, **names: str) -> ProgramParts:
-        """Compute x = (J C (J + S^T)^T)^(-1) right; `names` are those of arrays that differ from the system's."""
+        """Compute x = (J C (J + S^T)^T)^(-1) right; `names` renames arrays of the system, such as x="x2"."""
         yield from FACTORS.substitute(self.terms, self._symmetric.order, self._front_table, solve, **names)
 
     # --- the matrix

@@ -24,7 +24,7 @@ from udkjax.scene.mechanism import Mechanism
 
 
 class LooseFriction(NamedTuple):
-    """Masks of the joints with friction: `loose` loads, sliding, and which joints (rows) load which others."""
+    """Masks over j joints with friction: undetermined load, sliding, and which joint (row) loads which other joint (column)."""
 
     loose: Bool[Array, "j"]
     slides: Bool[Array, "j"]

@@ -256,7 +256,7 @@ def settle(
 
 
 class _Growth(NamedTuple):
-    """A solution with a share of friction that grows."""
+    """State of a continuation in the share of friction: solution x, share reached, next increment, and whether it continues."""
 
     x: Array
     reached: Array  # the share

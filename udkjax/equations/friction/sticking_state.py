@@ -33,7 +33,7 @@ from udkjax.transforms.gradients import stop_gradients
 
 
 class StickingLoads(NamedTuple):
-    """The multipliers of a mechanism some of whose joints stick, and its friction."""
+    """Multipliers, and loads of friction, of a mechanism in which some joints stick."""
 
     multipliers: Float[Array, "m"]
     friction: Float[Array, "n"]  # loads of all friction without the constant torques, which `loads.force` includes
@@ -95,7 +95,7 @@ class StickingState(eqx.Module):
     def _respond(
         self, directed: DirectedMechanism, modes: FrictionModes, rows: "_Rows", t: Time, q: Vector, v: Vector
     ) -> tuple[StickingLoads, Response]:
-        """Return the loads in given modes, and the motion of the joints."""
+        """Return the loads in given modes, and the accelerations of the joints with the margins of their friction forces."""
         mechanism, root, count = directed.with_sides(modes.sides(jnp)), uk.inverse_sqrt_mass(self.mechanism), len(self.w)
         held = jnp.where(modes.locked, self.scales.length / directed.units(self.scales.length), 0.0)  # weights as in `Scales`
         w, free = jnp.concatenate([self.w, held]), uk.a_F(mechanism, t, q, v)

@@ -172,4 +172,4 @@ class ConstrainedRows(AbstractSystem):
 
     @abstractmethod
     def weighted_rates(self, t: Time, q: Vector, v: Vector) -> tuple[Float[Array, "m n"], Float[Array, "m"], Vector]:
-        """Return the same of all rows of velocities, with their residuals."""
+        """Return D and the residuals of all rows of velocities, weighted, and the units of coordinates, as in `weighted_rows`."""

@@ -72,5 +72,5 @@ class Eliminated:
 
 @lru_cache(maxsize=64)
 def _uses(kind: Structure, redundant_rows: tuple[int, ...]) -> list[int]:
-    """Return a list with an entry for each question so far, up to `WORTH`, of mechanisms with this structure and these rows."""
+    """Return the cached list that counts uses of a structure with these redundant rows, up to `WORTH`: one entry per use."""
     return []

@@ -26,7 +26,7 @@ TracedModel = Callable[..., list[np.ndarray]]
 
 
 class Sizes(NamedTuple):
-    """The sizes of the inputs and outputs of a model."""
+    """Sizes of the inputs and outputs of a model: parameters x, coordinates q, data d per position, and measures g."""
 
     parameters: int  # x
     coordinates: int  # q
@@ -35,7 +35,7 @@ class Sizes(NamedTuple):
 
 
 class Place(NamedTuple):
-    """The indices among the outputs of a measure, of its derivative with respect to s and of those with respect to x."""
+    """Indices of the outputs that are a measure g, its derivative dg/ds, and the derivatives dg/dx."""
 
     value: int
     by_value: int

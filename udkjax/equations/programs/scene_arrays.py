@@ -91,7 +91,7 @@ class SceneArrays(Generic[AnyArray]):
         return found[CURVATURE] if CURVATURE in found else self._xp.zeros(0)
 
     def linearization(self, t: Time, q: AnyArray, direction: AnyArray) -> dict[str, AnyArray] | None:
-        """Return arrays of the linearization at rest in one direction, the tangent part of the given one, by elimination.
+        """Return the linearization at rest along the tangent part of `direction`, as arrays by name, by elimination.
 
         `RestProgram.reduction` and the output "balance" explain those of `LINEARIZATION`. None if neither machine code nor
         floats of Python are possible.

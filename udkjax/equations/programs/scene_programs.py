@@ -131,7 +131,7 @@ class ScenePrograms(RunPrograms):
 
     @cached_property
     def for_derivatives(self) -> "ScenePrograms":
-        """The programs that are differentiated: these if the policy drops rows, else those with the policy `FALL_BACK`."""
+        """The programs to differentiate: these if the policy drops rows, else the same with the policy `FALL_BACK`."""
         if self.policy.drops:
             return self
         return ScenePrograms(*self._settings, RankPolicy.FALL_BACK, self._sharing, kernels=self._kernels)
@@ -197,7 +197,7 @@ class ScenePrograms(RunPrograms):
 
     @cached_property
     def differentiable(self) -> DifferentiablePrograms:
-        """The programs that are differentiated."""
+        """The accelerations and projections as differentiable loops, which reuse the factors of the value."""
         return DifferentiablePrograms(self._solver)
 
 

@@ -144,7 +144,7 @@ class Analysis(PrintsTable):
         return replace(self, scales=own)
 
     def with_rows_of(self, mechanism: Mechanism, only_switched: bool = False) -> "Analysis":
-        """Return the analysis of the mechanism with more constraints, of which rows are redundant is not known.
+        """Return the analysis of the mechanism with more constraints, without knowledge of their redundant rows.
 
         Its lengths, times and masses stay those of the original mechanism.
 

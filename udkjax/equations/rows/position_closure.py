@@ -130,7 +130,7 @@ def _fixed(x: Any) -> Any:
 
 
 def damped_step(rows: Rows[jax.Array], t: Time, q: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return q after one step, halved until the residual falls, and whether it does. At rounding level no step is taken."""
+    """Return q after one step, halved until the residual falls, and whether it fell. At rounding level no step is taken."""
     fixed, current = jax.tree.map(_fixed, (rows, q))
     size = jnp.linalg.norm(fixed.residual(t, current))
     is_open = size > rounding(rows.scales, current, jnp)

@@ -32,7 +32,7 @@ POSITIONS = 4  # positions of the motion in which a pin must not turn either
 
 
 class HeldPin(NamedTuple):
-    """A pin that does not turn."""
+    """A pin whose angle stays constant in every motion although Psi_q lets it change."""
 
     name: str
     bodies: tuple[str, ...]

@@ -56,7 +56,7 @@ _Found: TypeAlias = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 class _Units(NamedTuple):
-    """Weights of rows and units, by NumPy."""
+    """Weights of rows, units of coordinates and loads, and independent and redundant rows, as NumPy arrays."""
 
     weights: np.ndarray  # (m,)
     coordinates: np.ndarray  # (n, 1)

@@ -182,7 +182,7 @@ def violation(mechanism: Mechanism | ConstrainedSystem, solution: Annotated[Hist
 
 
 def _over_values(mechanism: Any, psi: Float[Array, "T m"], driver: str, values: Any) -> Float[Array, "T m"]:
-    """Return Psi along values of a driver, from that at time 0: the last rows are those of the drivers."""
+    """Convert Psi with all drivers at time 0 to Psi along values of one; rows of others are relative to the first position."""
     names = mechanism.driver_names
     if not names:
         return psi

@@ -287,7 +287,7 @@ def _uniqueness_of_loads(mechanism, analysis, knowledge, ts, q, rank_tol, frame,
 def _loads_by_numpy(
     mechanism: Mechanism, analysis: Analysis, history: StateArraysOverTime, *choices: Any, frame: Axes, about: About
 ) -> list[list[Array]]:
-    """Compute what `_loads` computes."""
+    """Compute the results of `_loads` by NumPy, for concrete numbers."""
     arrays, rows = state_arrays(mechanism), [name for name, _ in analysis.row_names]
 
     def of_piece(ts: np.ndarray, q: np.ndarray, v: np.ndarray) -> ByBody:

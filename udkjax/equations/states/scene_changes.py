@@ -205,7 +205,7 @@ class KnownState(eqx.Module):
 
 
 class Knowledge(NamedTuple):
-    """The constraints along a motion, at its times T."""
+    """Known changes of the constraints along a motion, at its times T: joints that stick, and joints that events add or remove."""
 
     sticking: Bool[Array, "T F"] | None
     changes: SceneChanges | None
@@ -286,7 +286,7 @@ def scene_along(mechanism: Any, solution: Any) -> SceneAlong:
 
 
 def _over_values(mechanism: Mechanism, motion: Any, analysis: Analysis, ts: np.ndarray) -> SceneAlong:
-    """Return the mechanism along a `Kinematics` over the values of a driver: it has these at time 0, all others hold theirs."""
+    """Return the mechanism along a `Kinematics`, which has the driver's values at time 0; all other drivers hold theirs."""
     name, scene = motion.values_of, mechanism.without_origin
     if name not in mechanism.driver_names:
         return SceneAlong(_with_motions(scene), analysis, Knowledge(None, None), None, ts, True)

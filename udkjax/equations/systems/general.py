@@ -134,7 +134,7 @@ class MassOfEnergy(eqx.Module):
 
 
 class ForceOfEnergy(eqx.Module):
-    """The forces of Lagrange's equations beside M a: T_q - (T_v)_q v, and those that are given."""
+    """Forces of Lagrange's equations other than M a: T_q - (T_v)_q v, plus the applied forces."""
 
     kinetic: Callable[[Vector, Vector], Any]
     force: Callable[[Time, Vector, Vector], Any] | None
@@ -292,7 +292,7 @@ class GeneralEquations(ConstrainedRows):
         return jax.jacfwd(self._psi, 1)(t, q) * root, self._psi(t, q), root
 
     def weighted_rates(self, t: Time, q: Vector, v: Vector) -> tuple[Float[Array, "m n"], Float[Array, "m"], Vector]:
-        """Return A, and Psi_dot followed by phi, with the same units."""
+        """Return A = (Psi_q; phi_v), and Psi_dot followed by phi, with coordinates in units of M_ii^(-1/2), and these units."""
         root = self._units(q)
         return self._slopes(t, q, v) * root, self.violation(t, q, v)[1], root
 

@@ -56,7 +56,7 @@ class SmoothLoads:
         return [*(numbers[k] for k in self._used), t, *q, *v, *sides]
 
     def loads(self, of: Any, sides: Any, t: Any, q: Iterable[Any], v: Iterable[Any]) -> list[Any]:
-        """Return the loads of an element, or of the numbers of a system."""
+        """Return the loads of a force element, or of a system with the numbers `of`."""
         return self._loads(self.inputs(SmoothLoads.numbers(of), t, q, v, sides))
 
     def condition(self, index: int, of: Any, sides: Any, t: Any, q: Iterable[Any], v: Iterable[Any]) -> Any:

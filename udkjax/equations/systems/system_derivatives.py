@@ -121,7 +121,7 @@ class DifferentiableSystem:
         return KernelLoop(w.kernel(), ONCE)
 
     def _residual(self, equation: SystemEquation, k: int, only_rows: bool = False, **names: str) -> KernelLoop:
-        """Compute the residual of an equation; `only_rows`: that of a solution zero, without a load, by its rows."""
+        """Compute the residual of an equation; with `only_rows` only its right-hand side c, the residual of a zero solution."""
         w = KernelWriter(self._graph)
         for s, name, place in self._inputs:
             w.bind(s, names.get(name, name), None, place)

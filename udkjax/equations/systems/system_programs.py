@@ -28,7 +28,7 @@ class SystemPrograms(SystemTerms):
 
     @cached_property
     def for_derivatives(self) -> "SystemPrograms":
-        """The programs that are differentiated: these if the policy drops rows, else those with the policy `FALL_BACK`."""
+        """The programs to differentiate: these if the policy drops rows, else the same with the policy `FALL_BACK`."""
         return self if self.policy.drops else _system_programs(*self._settings, RankPolicy.FALL_BACK)
 
     @cached_property

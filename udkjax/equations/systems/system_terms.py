@@ -141,7 +141,7 @@ class SystemTerms(RunPrograms):
         return not any("velocity" in s.node.depends for row in self.functions.phi_v for s in row.values())
 
     def _at(self, outputs: Sequence[Scalar], **states: Sequence[Scalar]) -> list[Scalar]:
-        """Return scalars at another q or v."""
+        """Return `outputs` as functions of other states: q=..., v=... replace the scalars of q or v."""
         program = ScalarProgram(self._graph, [s for s, _, _ in self._inputs], outputs)
         values = {s.index: states[name][k] if name in states else s for s, name, k in self._inputs}
         return self._graph.copy(program, values)

@@ -179,7 +179,7 @@ def element_kinds(
 
 
 def _entries(x: Float[Array, "bodies"], which: Int[np.ndarray, "n"]) -> Float[Array, "n"]:
-    """Return the entries of some bodies; those after each other, as in chains, take one operation, in derivatives too."""
+    """Return the entries of some bodies; contiguous ones, as in chains, take one operation, also in derivatives."""
     start, count = int(which[0]), len(which)
     if np.array_equal(which, np.arange(start, start + count)):
         return x if count == len(x) else x[start : start + count]

@@ -97,7 +97,7 @@ def with_switched_friction(forces: dict[str, Any], names: Sequence[str]) -> dict
 def with_switches(
     mechanism: Mechanism, names: Sequence[str], others: Mapping[str, Joint], friction: Mapping[str, Friction]
 ) -> Mechanism:
-    """Return the mechanism with further joints, in which these and some of its own constraints are switched on.
+    """Return the mechanism with further joints, in which these joints and the named constraints have a switch, set to on.
 
     Args:
         mechanism: The scene.

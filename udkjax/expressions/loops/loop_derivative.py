@@ -141,7 +141,7 @@ def _prefixed(addressed: Addressed, prefix: str) -> Addressed:
 
 
 def _kernel(kernel: Kernel, seeds: Addressed, outputs: Addressed) -> Kernel | None:
-    """Return a kernel that also takes `seeds` and writes different results."""
+    """Return the kernel with further inputs `seeds` that writes `outputs` instead; None if there are no outputs."""
     if not outputs:
         return None
     inputs = list(zip(kernel.program.inputs, kernel.inputs, strict=True))

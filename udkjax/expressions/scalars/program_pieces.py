@@ -25,7 +25,7 @@ class ProgramPiece(NamedTuple):
 
 
 def pieces_of(program: ScalarProgram, late: Collection[int] = (), longest: int = LONGEST) -> tuple[list[ProgramPiece], int]:
-    """Cut a program into pieces of equal length; constants are no values that pieces pass, as each piece writes its own.
+    """Cut a program into pieces of equal length. Pieces do not pass constants: each writes its own.
 
     Args:
         program: The program.

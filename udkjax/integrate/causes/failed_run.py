@@ -61,7 +61,7 @@ class FailedRun:
         return [self.end, *listed]
 
     def _has_drifted(self, k: int) -> bool:
-        """Return whether an output is where the run was found to drift; that before it is closed."""
+        """Return True if Psi at output k exceeds the tolerance of drift, or the run ended by drift before this output."""
         if self.result != Result.drift or self.ts[k] > self.time:
             return self.result == Result.drift
         return not np.max(np.abs(self.psi(self.ts[k], self.q[k])) / self.row_scales, initial=0.0) <= self.drift_tol

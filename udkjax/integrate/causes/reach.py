@@ -139,7 +139,7 @@ def dead_point(mechanism: Mechanism, found: Reach, drivers: list[str]) -> str:
 
 
 def _value(mechanism: Mechanism, name: str, t: float) -> str:
-    """Return the value of a driver at a time (s) as text: of a drawing, as its other answers count it, else in rad or m."""
+    """Return the value of a driver at a time (s) as text: in the count of the drawing if there is one, else in rad or m."""
     driver = mechanism.drivers[name]
     value = float(driver.motion(t))
     if mechanism.drawing is not None:

@@ -68,7 +68,7 @@ class ErrorEstimates(eqx.Module):
 
 
 class OrderControl(eqx.Module):
-    """The state of the choice of order and step."""
+    """State of the control of order and step size."""
 
     order: Int[Array, ""]  # order of the next step
     step: Float[Array, ""]  # the planned next step
@@ -125,7 +125,7 @@ def step_factor(error: Float[Array, ""], order: Int[Array, ""]) -> Float[Array, 
 
 
 class History(eqx.Module):
-    """The state of the solver at t_n."""
+    """State of the solver at t_n: y, the modified divided differences phi of its derivative, and the choice of order and step."""
 
     ages: Float[Array, "N"]  # t_n - t_{n-j}, j = 0, 1, ...
     phi: Float[Array, "N y"]

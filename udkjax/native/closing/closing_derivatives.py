@@ -20,7 +20,7 @@ from udkjax.native.module.prologue import PROLOGUE, write_prologue_derivative
 
 
 class ClosingDerivative(Closing):
-    """The base of both modes."""
+    """Base of the forward and the reverse derivative of closing."""
 
     def _increase(self, f: Function, name: str, i: Value | int, x: Value, pointer: str = "work"):
         self.put_entry(f, name, i, self.entry(f, name, i, pointer) + x, pointer)

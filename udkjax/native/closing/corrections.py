@@ -33,7 +33,7 @@ class EliminationCorrection(ProgramDerivative):
         """Do nothing: the evaluation already stores all intermediate results."""
 
     def prepare_derivative(self, f: Function):
-        """Do nothing."""
+        """Do nothing: derivatives by elimination need no preparation."""
 
     def find_rank(self, f: Function):
         """Set `rank` to the rank of Psi_q, after an evaluation."""

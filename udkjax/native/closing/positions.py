@@ -86,7 +86,7 @@ class PositionCode:
             "q": np.empty((members, count, sizes.coordinates)),
             "out": np.empty((members, count, self.programs.output_count)),
             "end": np.empty((members, count)),
-            "next": np.zeros(2, np.int64),  # and whether memory was refused
+            "next": np.zeros(2, np.int64),  # the index of the next member, and whether memory was refused
         }
         fields = {name: a.ctypes.data for name, a in arrays.items()}
         fields |= {"members": members, "count": count, "marches": guess is None, "longest": np.float64(longest).view(np.int64)}

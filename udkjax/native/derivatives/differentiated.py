@@ -8,7 +8,7 @@ from udkjax.native.run.trajectory import Trajectory
 
 
 class Differentiated(Trajectory):
-    """The base of both modes: programs of derivatives, and memory for their intermediate results.
+    """Base of forward and reverse mode: programs of derivatives, and memory for their intermediate results.
 
     `active` marks the numbers of the scene that have derivatives; positions and velocities always have them.
     """

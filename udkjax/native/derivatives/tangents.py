@@ -281,7 +281,7 @@ class Forward(Differentiated):
                     f.store(f.load(changes, i), self._way(f, way), tangent_lane + self.place("constants", i, "tangent"))
 
     def _changes_of_numbers(self, f: Function, way: str, member: Value, direction: Value) -> Value:
-        """Return the address of the tangents of a member's numbers along a direction, with those of the row of samples."""
+        """Return the address of the tangents of a member's numbers along a direction; sampled ones have those of the current row."""
         count = self.code.number_count
         numbers = f.at(self.member_address(f, f"{way}numbers", member), direction * count)
         places = self.active_samples

@@ -15,7 +15,7 @@ LIBRARY = "nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1"
 
 
 class CudaError(RuntimeError):
-    """An error of the driver, in its own words."""
+    """An error of the CUDA driver, in its own words."""
 
 
 class CudaDriver:

@@ -18,7 +18,7 @@ STRNCAT = "declare ptr @strncat(ptr, ptr, i64)"
 
 
 class Words:
-    """The words of a handler: the addresses of functions of the driver, then further numbers.
+    """Table of 64-bit words that a handler reads: addresses of functions of the CUDA driver, then further numbers.
 
     Args:
         functions: the names of functions, in addition to those that every handler needs.
@@ -31,16 +31,16 @@ class Words:
 
     @property
     def text(self) -> str:
-        """The definition of the words."""
+        """LLVM's definition of the table."""
         return f"@words = global [{len(self.names)} x i64] zeroinitializer"
 
     def fill(self, library: machine.Library, of: CudaDriver, *further: int):
-        """Set the words of a loaded handler."""
+        """Write the table of a loaded handler: the addresses of its functions in the driver `of`, then the `further` numbers."""
         words = (ctypes.c_int64 * len(self.names)).from_address(library["words"])
         words[:] = [*map(of.address, self.functions), *further]
 
     def load(self, f: Function, name: str, base: str = POINTER) -> Value:
-        """Return a word."""
+        """Load the entry `name` of the table."""
         return f.load("@words", self.names.index(name), base=base)
 
     def drive(self, f: Function, name: str, *arguments: Value | str) -> Value:

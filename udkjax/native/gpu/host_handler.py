@@ -98,7 +98,7 @@ def load(of: CudaDriver, handler: int, threads: int | None = None) -> machine.Li
 
 @cache
 def _pinned(of: CudaDriver) -> int:
-    """Return the address of pinned memory; 0 if there is none."""
+    """Return the address of new page-locked memory of the host; 0 if the driver has none."""
     place = ctypes.c_int64()
     try:
         with of.current(_device()):
@@ -122,7 +122,7 @@ def module_text() -> str:
 
 
 def _copy_and_call() -> Function:
-    """Write the handler."""
+    """Write the handler that copies inputs to the host, runs the operation there, and copies outputs back."""
     f = Function("copy_and_call", [(POINTER, "frame")], returns="ptr", cold=True)
     frame = f.given["frame"]
     answer_metadata(f, frame)

@@ -84,7 +84,7 @@ class _Launch:
             self.answer.value = WORDS.drive(self.f, name, *arguments)
 
     def _run(self, members: Value):
-        """Launch threads for so many members."""
+        """Launch one thread for each member."""
         f, parameters = self.f, Value(self.f, self.f.reserve(POINTER), POINTER)
         f.store(self.call, parameters, base=POINTER)
         blocks = f.arithmetic("div", members + (BLOCK - 1), BLOCK)
@@ -95,7 +95,7 @@ class _Launch:
     # --- reverse mode
 
     def _run_in_chunks(self):
-        """Run all members with a buffer of records."""
+        """Run all members with a buffer of records, which is doubled until every record fits."""
         f, longest = self.f, Value(self.f, self.f.reserve(DOUBLE), POINTER)
         self._copy(TO_HOST, longest, self._field("given steps", POINTER), 8)
         steps = f.select(self._is_well, self.module.to_int(f, f.load(longest)), f.const(0, INT))

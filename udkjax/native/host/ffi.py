@@ -160,19 +160,19 @@ def _thread_count(f: Function, frame: Value) -> Value:
 
 
 def _add(f: Function, work: Value, word: int, number: Value | int) -> Value:
-    """Add to a word of shared work; return its previous value."""
+    """Add a number atomically to a word of shared work; return the word's previous value."""
     number = f.like(number, INT, 1)
     return f.op(f"atomicrmw add ptr {f.at(work, word, 'i64').name}, i64 {number.name} seq_cst", INT)
 
 
 def _leave(f: Function, work: Value):
-    """Release shared work; the last thread frees it."""
+    """Release this thread's share of the work; the last thread frees the memory."""
     with f.if_(_add(f, work, USERS, -1).is_(1)):
         f.line(f"call void @free(ptr {work.name})")
 
 
 def _help() -> Function:
-    """Write `help(work)`: take part in the work unless it is closed."""
+    """Write `help(work)`, by which a thread joins a run unless the work is closed."""
     f = Function("help", [(POINTER, "work")], cold=True)
     work = f.given["work"]
     with f.if_(_add(f, work, BEGUN, 1) < CLOSED):

@@ -172,7 +172,7 @@ class _Target(NamedTuple):
 
 @lru_cache(maxsize=256)
 def _target(function: HostFunction) -> _Target:
-    """Register a function in XLA."""
+    """Register a function with XLA as the target of custom calls."""
 
     @ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)
     def handle(frame: int) -> int | None:

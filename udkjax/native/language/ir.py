@@ -302,7 +302,7 @@ class Function:
         return self.op(f"ptrtoint ptr {pointer.name} to i64", INT).is_(0)
 
     def leave(self, result: str = "void"):
-        """Return from the function; text that follows is reached by other ways only."""
+        """Write a return; only branches that pass it reach the text that follows."""
         self.line(f"ret {result}")
         self.line(f"{self._label('after')}:")
 

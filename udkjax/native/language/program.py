@@ -145,7 +145,7 @@ class Writer:
         return [self._with_sign(self.program.outputs[k]) for k in chosen]
 
     def check(self):
-        """Write each operation that is not arithmetic, of any numbers: raise `UnsupportedError` if one is not supported."""
+        """Write every operation that is not arithmetic, to raise `UnsupportedError` if one is not supported."""
         nodes = self.program.graph.nodes
         for index in self.program.order:
             node = nodes[index]

@@ -48,7 +48,7 @@ class Array:
 
 
 class SingleNumber(Array):
-    """One number."""
+    """An array of shape (), held as a value in registers."""
 
     def __init__(self, value: Value, varies: bool):
         super().__init__((), value.base, varies)
@@ -59,7 +59,7 @@ class SingleNumber(Array):
 
 
 class Constant(Array):
-    """Known numbers; `memory` stores those that are not all equal."""
+    """Constant numbers; `memory` stores them unless they are all equal."""
 
     def __init__(self, numbers: Any, memory: Callable[[np.ndarray], "Stored"]):
         self.numbers, self._memory = np.asarray(numbers), memory
@@ -128,7 +128,7 @@ class Stored(Array):
 
 
 class Lazy(Array):
-    """An array by a function of the index."""
+    """An array whose elements a function of the index computes when they are read."""
 
     def __init__(self, shape: Sequence[int], base: str, operands: Sequence[Array], read: Callable[[Index], Value], cost: int = 0):
         super().__init__(shape, base, any(x.varies for x in operands), cost + sum(x.cost for x in operands))

@@ -100,7 +100,7 @@ def _places(x: Array) -> Array:
 
 
 def _moved(x: Array, places: Array) -> Array:
-    """Move the elements of the last axis to places."""
+    """Move the elements of the last axis to the given indices."""
     chosen = places[..., None, :] == np.arange(x.shape[-1])[:, None]
     return jnp.sum(jnp.where(chosen, x[..., None, :], jnp.zeros((), x.dtype)), -1).astype(x.dtype)
 

@@ -96,7 +96,7 @@ class Lowering:
         return Stored(address, shape, base, varies)
 
     def stored(self, x: Array) -> Array:
-        """Return an array whose elements are computed."""
+        """Return the array with all of its elements computed, in memory."""
         if isinstance(x, SingleNumber | Stored | Constant):
             return x
         return self.copied(x)

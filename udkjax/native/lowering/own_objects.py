@@ -38,7 +38,7 @@ class OwnObject:
 
     @classmethod
     def of(cls, x: Any) -> "OwnObject":
-        """Leave the numbers of an object out.
+        """Return an object without its numbers.
 
         Raises:
             UnsupportedError: it has arrays of another type than float64.
@@ -56,11 +56,11 @@ class OwnObject:
 
     @property
     def template(self) -> Any:
-        """The object, with the shapes of its arrays instead of these."""
+        """The object with the shapes of its arrays in place of the arrays."""
         return jax.tree.unflatten(self.structure, [x if isinstance(x, NumberOfRun) else x[1] for x in self.leaves])
 
     def filled(self, numbers: jax.Array) -> Any:
-        """Return the object with numbers, which are in one vector."""
+        """Return the object with its arrays taken from one vector."""
         parts = iter(np.split(np.arange(sum(self.sizes)), np.cumsum(self.sizes)[:-1]))
         leaves = [numbers[next(parts)].reshape(x.shape) if isinstance(x, NumberOfRun) else x[1] for x in self.leaves]
         return jax.tree.unflatten(self.structure, leaves)
@@ -110,13 +110,13 @@ class Input(NamedTuple):
 
 
 class Written(NamedTuple):
-    """A function of machine code, and how many numbers of memory it takes in each lane."""
+    """Machine code of a function, and the float64 numbers of scratch memory that it needs in each lane."""
 
     function: LoweredFunction
     size: int
 
     def within(self, size: int) -> LoweredFunction:
-        """Return the function, for memory of `size` numbers in each lane.
+        """Return the function if `size` numbers of scratch memory in each lane are enough for it.
 
         Raises:
             RuntimeError: the memory is too small.
@@ -128,7 +128,7 @@ class Written(NamedTuple):
 
 @lru_cache(maxsize=64)
 def written(code: OwnMethod, inputs: tuple[Input, ...], width: int) -> Written:
-    """Return `name(inputs..., scratch)`, whose outputs are in `scratch` from its beginning, one after another.
+    """Return the function `name(inputs..., scratch)` of a user's method, which writes its outputs from the start of `scratch`.
 
     The text is stored on disk by the object's source, if that is known: tracing and lowering take 30 ms.
     """
@@ -152,7 +152,7 @@ def _traced(code: OwnMethod, shapes: tuple[tuple[int, ...], ...]) -> Any:
 
 
 def _write(f: LoweredFunction, closed: Any, inputs: Sequence[Input]) -> int:
-    """Write a jaxpr; return the size of its memory."""
+    """Write the operations of a jaxpr; return the float64 numbers of scratch memory that they need."""
     to = Lowering(f, f.given["scratch"], lower)
     strides = (None if x.stride is None else (x.stride, 1) for x in inputs)
     given = [Stored(f.given[x.name], x.shape, DOUBLE, True, strides=y) for x, y in zip(inputs, strides, strict=True)]

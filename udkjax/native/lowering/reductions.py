@@ -61,7 +61,7 @@ def _reduced(
 
 
 def reduce_axes(start: Any, join: Any, to: Lowering, inputs: list[Array], p: dict[str, Any], out: Any) -> Array:
-    """Join the elements along some axes."""
+    """Reduce an array along some axes by the operation `join`."""
     x, axes = inputs[0], p["axes"]
     kept = [a for a in range(len(x.shape)) if a not in axes]
 

@@ -105,7 +105,7 @@ def triangular_solve(to: Lowering, equation: Any, inputs: list[Array]) -> list[A
 
 
 def linear_solve(to: Lowering, equation: Any, inputs: list[Array]) -> list[Array]:
-    """Solve by a function of JAX; the others that it has are for derivatives."""
+    """Solve by the `solve` function of `lax.custom_linear_solve`; its other functions serve derivatives."""
     lengths, solve = equation.params["const_lengths"], equation.params["jaxprs"].solve
     first = lengths.matvec + lengths.vecmat
     return to.closed(solve, [*inputs[first : first + lengths.solve], *inputs[sum(lengths) :]])

@@ -50,7 +50,7 @@ class _UnknownError(Exception):
 
 @cache
 def _versions() -> tuple[Any, ...]:
-    """Return the versions of everything that counts by name.
+    """Return the versions of everything that a key contains by name only.
 
     Raises:
         _UnknownError: the package has no files.
@@ -63,13 +63,13 @@ def _versions() -> tuple[Any, ...]:
 
 
 def _is_known(module: Any) -> bool:
-    """Return whether objects of a module count by name."""
+    """Return True if a key contains objects of a module by name only."""
     parts = str(module).split(".")
     return "random" not in parts and (parts[0] in _KNOWN or str(module).startswith(_PREFIXES))
 
 
 class _Source:
-    """The digest of objects; each is added once."""
+    """SHA-256 digest of objects; each object is added once."""
 
     def __init__(self):
         self.digest, self._places, self._kept = hashlib.sha256(), {}, []
@@ -123,7 +123,7 @@ class _Source:
                 self._add_named(x)
 
     def _add_named(self, x: Any):
-        """Add a module, or a function that is not Python's: it counts by name, or by the function that it compiles."""
+        """Add a module, or a function that is not Python's, by its name or by the function that it compiles."""
         module = x.__name__ if isinstance(x, ModuleType) else getattr(x, "__module__", None)
         name = getattr(x, "__name__", None)
         if _is_known(module) and isinstance(name, str) and name not in _CHANGING:

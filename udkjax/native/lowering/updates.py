@@ -41,7 +41,7 @@ def scatter(adds: bool, to: Lowering, inputs: list[Array], p: dict[str, Any], ou
 
 
 def dynamic_update_slice(to: Lowering, inputs: list[Array], p: dict[str, Any], out: Any) -> Array:
-    """Put a part into an array, moved so that it is inside."""
+    """Write a block into an array; start indices are clamped so that the block fits."""
     x, change, *given = inputs
     f, starts = to.f, []
     for s, n, k in zip(given, x.shape, change.shape, strict=True):

@@ -72,7 +72,7 @@ def index_of(f: Function, x: Array) -> Operand:
 
 
 def dynamic_slice(to: Lowering, inputs: list[Array], p: dict[str, Any], out: Any) -> Array:
-    """Return a part of an array from some indices on, moved so that it is inside."""
+    """Return a block of an array from start indices on, which are clamped so that the block fits."""
     x, f = to.stored(inputs[0]), to.f
     starts = [clamped(f, index_of(f, s), n - k) for s, n, k in zip(inputs[1:], x.shape, out.shape, strict=True)]
     found = Lazy(

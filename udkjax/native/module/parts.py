@@ -1,4 +1,4 @@
-"""The parts of a module, which the algorithms of a run call: here those of a module that needs none.
+"""The parts of a module, which the algorithms of a run call. These base classes need no programs or memory.
 
 A part says which programs of the scene it needs, which memory it reserves, and which functions it writes. Modules that run choose
 theirs from parts/.
@@ -19,7 +19,7 @@ BeginMember = Callable[[Value, Value], None]  # loads a member into a lane: (lan
 
 
 class Part:
-    """A part that needs nothing."""
+    """Base of the parts of a module."""
 
     shared: Collection[str] = ()
     """Arrays that it shares with other parts: `couplings`, if M is not diagonal; `rows`, Psi_q and M^(-1/2); `rates`, if rows of
@@ -30,10 +30,10 @@ class Part:
     """The arrays of programs in its memory."""
 
     def reserve(self):
-        """Reserve its own memory."""
+        """Reserve the memory of the part."""
 
     def write(self):
-        """Write its functions."""
+        """Write the functions of the part."""
 
 
 class AccelerationPart(Part):
@@ -101,7 +101,7 @@ class ProjectionPart(Part):
 
 
 class FrictionPart(Part):
-    """The loads of joints with friction; this one needs no further rounds."""
+    """Friction that depends on the loads of joints; this base class needs no further rounds."""
 
     settles = False
 
@@ -118,7 +118,7 @@ class FallbackPart(Part):
     finds_dependent_rows = False  # whether rows that depend on others show by their pivots
 
     def enter(self, f: Function, lane: Value, numbers: Value):
-        """Compute its constants in a lane from the numbers of the scene."""
+        """Compute the constants of the fallback in a lane from the numbers of the scene."""
 
     def choose_lanes(self, f: Function, s: Lane, due: Value, is_due: Value):
         """Choose the lanes of the next attempt: if any are `due` for a fallback, only these."""
@@ -160,11 +160,11 @@ class FallbackPart(Part):
         do()
 
     def evaluate_settled(self, f: Function, s: Lane, settle: Callable[[], None], evaluate: Callable[[], None]):
-        """Run `evaluate`, with loads that `settle` has found, and finds again in steps of the fallback."""
+        """Run `evaluate`; in steps of the fallback, with loads that `settle` finds anew."""
         evaluate()
 
     def with_lost_loads(self, s: Lane, accept: Value, lost: Value) -> Value:
-        """Return the lanes that are `lost`, and those whose accepted step left unbounded loads of joints out."""
+        """Return the lanes that are `lost`, or whose accepted step left out unbounded loads of joints."""
         return lost
 
     def if_safe(self, s: Lane, mask: Value) -> Value:
@@ -261,10 +261,10 @@ class StiffnessPart(Part):
         return near
 
     def return_to_point(self, s: Lane, mask: Value, k: int):
-        """Go on from point k in some lanes."""
+        """Restore the state of point k in the masked lanes, before the run continues from there."""
 
     def begin_anew(self, f: Function, s: Lane) -> Value:
-        """Return `begin` of steps from there."""
+        """Return the `begin` with which steps start anew after an event."""
         return f.const(0.0, DOUBLE, f.width)
 
     # --- the run of all members (leaving.py)

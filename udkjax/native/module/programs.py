@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 
 class CalledProgram(NamedTuple):
-    """The outputs of a program, and where a module stores those arrays that do not go to its array of the same name."""
+    """The outputs of a program, and the arrays of the module that store outputs under another name."""
 
     outputs: tuple[str, ...]
     stored: Mapping[str, str] = {}

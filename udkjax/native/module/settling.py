@@ -26,7 +26,7 @@ SETTLING = (*AT_STATE, *AT_END)
 
 
 class LoadFriction(FrictionPart):
-    """The loads of joints, which may need further rounds."""
+    """Friction that depends on the loads of joints, found by further rounds of Newton's method."""
 
     settles = True
     programs = (FURTHER,)

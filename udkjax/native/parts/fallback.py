@@ -23,7 +23,7 @@ RESULTS = ("a", "q", "v", "dq", "dv")  # of the fallback
 
 
 class RankRevealing(FallbackPart):
-    """Steps by a rank-revealing method."""
+    """Steps repeated by a rank-revealing method where pivots are too small."""
 
     finds_dependent_rows = True
     shared = ("couplings", "rates")

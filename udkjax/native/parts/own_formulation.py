@@ -17,7 +17,7 @@ _TRIAL = (2, 3)  # the numbers of rows and coordinates by which the operations o
 
 @dataclass(frozen=True)
 class OwnFormulationCode(FormulationCode):
-    """Accelerations by the lowered text of a formulation, whose arrays are numbers of the run."""
+    """Accelerations by a user-defined formulation, lowered to machine code; its arrays are numbers of the run."""
 
     own: OwnObject
 

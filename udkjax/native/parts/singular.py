@@ -46,7 +46,7 @@ def limit_of_error(f: Function, s: Lane, method: Method, time_left: Value) -> Va
     A shorter step across the singular configuration would have a larger rounding error, as its nodes are nearer to it. The run
     would creep there by ever shorter steps, whose errors add up to much more, and leave out rows that are independent. This only
     holds if the singular configuration is certain to be in a gap between nodes: a parabola and a straight line through the
-    latest distances predict it there. They do not where the mechanism turns back nearby, and shorter steps are needed.
+    latest distances predict it there. If the mechanism turns back before it, they predict none, and shorter steps are needed.
     """
     straight = s.distance2 * (s.point3_t - s.point2_t) / (s.distance1 - s.distance2)
     is_certain = f.abs(straight - time_left) < s.step * method.clearance

@@ -51,7 +51,7 @@ def write_end_piece(module: Module):
 
 
 class _EndOfPiece:
-    """The function `end_piece` while it is written."""
+    """Writer of the function `end_piece`."""
 
     def __init__(self, module: Module):
         self._module, (f, s) = module, module.function("end_piece")

@@ -71,7 +71,7 @@ class StageEquations:
         p.add("cleared")
 
     def _reserve(self):
-        """Hook: reserves further memory."""
+        """Reserve the memory of a subclass; nothing by default."""
 
     def write(self):
         """Write all functions."""
@@ -89,7 +89,7 @@ class StageEquations:
             solve(DenseMatrices(self._exact, f))
 
     def _write_further(self):
-        """Hook: writes further functions."""
+        """Write the functions of a subclass; nothing by default."""
 
     def exact(self, f: Function) -> DenseMatrices:
         """Return the matrix at a solved stage, in a function."""
@@ -249,7 +249,7 @@ class StageEquations:
 
 
 class StagesOfChosenSteps(StageEquations):
-    """The stages of a module that chooses the method of each step, and the numbers that the choice needs.
+    """The stages of a module that chooses between explicit and implicit steps, with the numbers that this choice needs.
 
         smooth_error(work)    D^(-1) of the error of velocities, where an implicit step is tried
 

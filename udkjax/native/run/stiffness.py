@@ -94,7 +94,7 @@ class LeavingIfStiff(StiffnessPart):
 
 
 class ImplicitSteps(StiffnessPart):
-    """Steps by an implicit method."""
+    """Run every step by an implicit method."""
 
     stages: type[StageEquations] = StageEquations
 
@@ -123,7 +123,7 @@ class ImplicitSteps(StiffnessPart):
         s.stepping = stepping
 
     def _take_explicit_stages(self, f: Function, s: Lane, stepping: Value, mask: Value, explicit: Callable[[], None]):
-        """Take the stages of explicit steps; there are none."""
+        """Do nothing: no step is explicit."""
 
     def _take_stages_in(self, f: Function, s: Lane, stepping: Value, mask: Value, take: Callable[[], None]):
         mask = (stepping > 0.5) & mask

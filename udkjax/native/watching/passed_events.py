@@ -20,7 +20,7 @@ class Turning:
 
     @property
     def sides(self) -> range:
-        """The sides of kinks."""
+        """Indices of the sides of kinks among all sides."""
         first = min(first for _, _, first in self.renewals)
         return range(first, first + sum(smooth.count for smooth, _, _ in self.renewals))
 
@@ -31,7 +31,7 @@ class Turning:
 
 @dataclass(frozen=True)
 class SlideLock:
-    """The constraint by which a joint sticks."""
+    """The lock that holds a joint at rest, as a program of the numbers that depend on q."""
 
     key: str  # text of the program
     program: ScalarProgram = field(compare=False)  # its numbers that depend on q, from q and its constant numbers

@@ -261,7 +261,7 @@ class _Modes:
 
 
 class _ChoiceWithoutLocks(_Modes):
-    """The choice between both directions in the mechanism of the scene."""
+    """Modes of joints in a mechanism without locks: a joint that stops turns round, or goes on."""
 
     def _choose(self, stops, leaves, sign):
         found = self._turn(stops)
@@ -270,7 +270,7 @@ class _ChoiceWithoutLocks(_Modes):
 
 
 class _Choice(_Modes):
-    """The choice in the mechanism with locks."""
+    """Modes of joints in a mechanism with locks: a joint that stops may also stick."""
 
     def _choose(self, stops, leaves, sign):
         f, module = self._f, self._module

@@ -151,7 +151,7 @@ class Mobility(NamedTuple):
 
     @property
     def words(self) -> str:
-        """Both counts, as a course says them."""
+        """Gruebler's count, and the degrees of freedom if they differ, as a phrase."""
         elements = f"{self.links} links and {plural(self.joints, 'joint')}"
         same = f"{self.counted}, by Gruebler's count of {elements}"
         if self.true is None or self.true == self.counted:

@@ -94,7 +94,7 @@ class PinMotion(PrintsTable):
         return [size, size * turning, size * turning**2], turning
 
     def counted(self, count: Count) -> "PinMotion":
-        """Return the same motion, shown as values are counted."""
+        """Return the same motion with the driver's values shown by this count."""
         return dataclasses.replace(self, count=count)
 
     def title(self) -> str:

@@ -1,4 +1,4 @@
-"""Pressure angles of cams: between the force on a follower and the way it gives."""
+"""Pressure angles of cams: between the contact force on a follower and the follower's direction of motion."""
 
 from typing import Annotated
 
@@ -28,7 +28,7 @@ RANK = 1e3 * ROUNDING  # relative to the largest singular value: motions with le
 def pressure_angle(
     mechanism: Mechanism, motion: Annotated[StateHistory, HISTORY], cam: str, driver: Drive = None
 ) -> Float[np.ndarray, "T"]:
-    """Return the pressure angle (rad, 0 to pi/2) of a cam: that between the normal at its contact and the way of the follower.
+    """Return the pressure angle (rad, 0 to pi/2) of a cam: from the normal at its contact to the follower's direction of motion.
 
     With the driver held and the cam taken away, the follower can move in one way, w at the contact. With the normal n of the
     cam there, the angle is acos(|n . w| / |w|). It is thus defined in dwells as well. The cam drives its follower best at zero,
@@ -95,7 +95,7 @@ def _slope(mechanism: Mechanism, driver: str | Coordinate, q: Float[Array, "bodi
 
 
 def _ways(rows: Float[np.ndarray, "T rows n"]) -> Float[np.ndarray, "T n"]:
-    """Return the one motion that each of several Jacobians leaves free; NaN if there is none, or several."""
+    """Return the null vector of each of T Jacobians whose null space has dimension one; NaN for the others."""
     values, vectors = np.linalg.svd(rows)[1:]
     free = rows.shape[2] - np.sum(values > RANK * values[:, :1], axis=1)
     return np.where(free[:, None] == 1, vectors[:, -1], np.nan)

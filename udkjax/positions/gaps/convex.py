@@ -26,7 +26,7 @@ class Feature(NamedTuple):
     at: Int[np.ndarray, "N"]  # or its end that is closest: 1 the start, 2 the end; 0: neither
 
     def take(self, k: Any) -> "Feature":
-        """Return those of the cases k."""
+        """Return the features of the cases k."""
         return Feature(*(x[k] for x in self))
 
 

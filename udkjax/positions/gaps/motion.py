@@ -42,12 +42,12 @@ class PolynomialMotion(NamedTuple):
 
     @property
     def known(self) -> Bool[np.ndarray, "pieces"]:
-        """A mask of the polynomials that are known."""
+        """Mask of the intervals with a polynomial: those of positive length with finite control points."""
         return np.isfinite(self.points).all((0, 2, 3)) & (np.diff(self.u) > 0)
 
     @property
     def missing(self) -> float:
-        """The share of the range in which nothing is known."""
+        """Fraction of the range without polynomials."""
         return max(0.0, 1.0 - float(np.diff(self.u)[self.known].sum() / (self.u[-1] - self.u[0])))
 
     @property

@@ -41,11 +41,11 @@ class PartPairs(NamedTuple):
 
     @property
     def radius(self) -> Float[np.ndarray, "n"]:
-        """The sums of both radii."""
+        """The sum of both radii of each pair (m)."""
         return self.radii[0] + self.radii[1]
 
     def take(self, k: Any) -> "PartPairs":
-        """Return those of the numbers k."""
+        """Return the pairs with the indices k."""
         return PartPairs(*(x.take(k, -1) for x in self))  # contiguous along the pairs, unlike x[..., k]
 
     @property

@@ -88,7 +88,7 @@ class PairSearch:
         self.crossings: list[np.ndarray] = []  # pairs, pieces, ends u, gaps there
 
     def gaps(self, k: np.ndarray, piece: np.ndarray, u: np.ndarray) -> Float[np.ndarray, "n"]:
-        """Return the gaps of pairs k at parameters."""
+        """Return the gaps (m) of the pairs k at parameters u of pieces of the motion."""
         pairs = self.pairs.take(k)
         return pairs.gaps([pose for pose, _ in self._poses(pairs, piece, u)])
 
@@ -143,7 +143,7 @@ class PairSearch:
         return pairs.gaps([np.ascontiguousarray(self.nodes[node, body].T) for body in pairs.bodies])
 
     def _way(self, k: np.ndarray, i: np.ndarray, j: np.ndarray) -> np.ndarray:
-        """Return the sum of the ways of both parts from node i to node j."""
+        """Return the sum (m) of the lengths of the paths of both parts of pairs k, from node i to node j."""
         line, turn = self.ways[:, j, self.pairs.bodies[:, k]] - self.ways[:, i, self.pairs.bodies[:, k]]
         return (line + turn * self.reach[:, k]).sum(0)
 
@@ -248,12 +248,12 @@ class PairSearch:
 
 
 def _roots(f: Callable[[Any, Any], Any], low: np.ndarray, high: np.ndarray, some: np.ndarray) -> np.ndarray:
-    """Return the roots of functions of the numbers `some` between parameters with values of opposite signs."""
+    """Return the roots of the functions with the indices `some`, between parameters at which their signs differ."""
     return find_root(lambda x, some: f(x, some.astype(int)), (low, high), args=(some,)).x if len(some) else low
 
 
 def _joined(stretches: Stretches) -> Stretches:
-    """Return stretches that overlap as one."""
+    """Return stretches in which overlapping ones are merged."""
     found: Stretches = []
     for start, end in sorted(stretches):
         if found and start <= found[-1][1]:

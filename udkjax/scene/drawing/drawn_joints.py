@@ -202,7 +202,7 @@ class CamPair(DrawnElement):
         return self._guided(profile, placement).unreachable(self.face is not None) if isinstance(profile, LawProfile) else ""
 
     def _guided(self, profile: LawProfile, placement: Placement) -> LawProfile:
-        """Return the laws with the follower's slide or pivot as drawn, in numbers that are not given."""
+        """Return the laws; the follower's slide or pivot as drawn supplies numbers that are not given."""
         cam = self._pair(placement)[0]
         centre, point = (placement.places[pin] for pin in self.pins)
         arm, numbers = point - centre, {}

@@ -242,7 +242,7 @@ class StackedPin(AbstractPin):
 
 
 def lowest_of_stack(pins: Mapping[str, AbstractPin], name: str) -> str:
-    """Return the pin on which a pin is stacked, directly or on others; the pin itself if it is on none. There are no circles."""
+    """Return the lowest pin of a stack, directly or through others; the pin itself if it is on none. Stacks have no cycles."""
     while isinstance(pin := pins[name], StackedPin):
         name = pin.stacked
     return name

@@ -55,7 +55,7 @@ class NumberField(NamedTuple):
     shape: tuple[int, ...] | None  # None: absent, any shape
 
     def holder(self, groups: Mapping[str, Mapping[str, Any]]) -> Any:
-        """Return the element, or its part such as a `Held`, that contains the number."""
+        """Return the element that contains the number, or the object within it that does, such as a `Held`."""
         return _at(groups[self.section][self.owner], self.path[:-1])
 
 

@@ -96,7 +96,7 @@ class Randomness(NamedTuple):
 
     @classmethod
     def of_chunk(cls, seed: int, k: int, step: float, shape: tuple[int, int]) -> "Randomness":
-        """Return those of chunk k, for chains and unknowns of this shape (C, K)."""
+        """Return the random numbers of chunk k, for chains and unknowns of this shape (C, K)."""
         random = np.random.default_rng([seed, k])
         size = step * random.uniform(*STEP_FACTORS, DRAWS)
         steps = np.clip(np.round(LENGTH * random.uniform(*LENGTHS, DRAWS) / size), 1, MOST_STEPS).astype(int)

@@ -67,7 +67,7 @@ class FixSearch:
         return next((x for x in found if x), None)
 
     def after(self, fix: Fix) -> "FixSearch | None":
-        """Return the search after a fix of this one."""
+        """Return the search in the mechanism after one further fix."""
         found = self._verified.get((fix.constraint, fix.change))
         return found[1] if found else None
 

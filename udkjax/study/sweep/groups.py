@@ -44,7 +44,7 @@ STRAIGHT_METHODS = (type(None), Auto, Elimination)  # without branches: fast in 
 
 
 class Shared(NamedTuple):
-    """The numbers that all members of a group share: those of settings, and what follows from them, if it is the same."""
+    """Numbers that all members of a group share: those of settings, and quantities computed from them if these are equal."""
 
     settings: Mapping[str, PyTree]
     closure: Closure | None  # the closed initial state

@@ -64,7 +64,7 @@ class CheapestTolerances(NamedTuple):
 
 @prints_table
 class ToleranceAnalysis:
-    """Samples of a mechanism whose numbers deviate, and what follows from them.
+    """Samples of a mechanism whose numbers deviate, and their statistics.
 
     Attributes:
         names: the names of the measures.
@@ -316,7 +316,7 @@ def _number(given: Any, unit: str, units: Units) -> float:
 
 
 def _share(holds: np.ndarray) -> tuple[float, float]:
-    """Return the share of samples, and its standard error, which is not zero even if it is that of all or of none."""
+    """Return the share of samples that hold and its standard error, which is positive even if all samples hold, or none."""
     count = len(holds)
     smoothed = (holds.sum() + 1.0) / (count + 2.0)
     return float(holds.mean()), float(np.sqrt(smoothed * (1.0 - smoothed) / count))

@@ -102,7 +102,7 @@ class BranchPosition(NamedTuple):
 
 
 def known_part(symbols: PositionSymbols, loop: VectorLoop) -> tuple[list[EquationLine], list[NamedQuantity]]:
-    """Return the lines of the sum K of all vectors that the unknowns leave alone, and its two components."""
+    """Return the lines of K, the sum of all vectors that do not depend on the unknowns, and its two components."""
     known = [x for x in loop.vectors if not _is_unknown(x, loop)]
     lines = []
     for axis in (0, 1):

@@ -121,7 +121,7 @@ class PlainFactor(EquationTerm):
 
 @dataclass(frozen=True)
 class SumOfTerms(EquationTerm):
-    """Terms with signs."""
+    """A sum of terms with signs."""
 
     parts: tuple[tuple[float, EquationTerm], ...]
 
@@ -148,7 +148,7 @@ class SumOfTerms(EquationTerm):
 
 @dataclass(frozen=True)
 class ProductOfTerms(EquationTerm):
-    """Factors."""
+    """A product of factors."""
 
     factors: tuple[EquationTerm, ...]
 

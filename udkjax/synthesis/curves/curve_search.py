@@ -39,7 +39,7 @@ class Kept(NamedTuple):
     family: np.ndarray
 
     def take(self, which: np.ndarray) -> "Kept":
-        """Return some of the linkages."""
+        """Return the selected linkages."""
         return Kept(self.x[which], self.topology.take(which), self.loss[which], self.family[which])
 
     def with_others(self, other: "Kept | None") -> "Kept":

@@ -108,10 +108,12 @@ class _Violation(NamedTuple):
     far: np.ndarray  # excess of squared distances of P, Q and R (3, D, K, T)
 
     def total(self, weight: float) -> np.ndarray:
+        """Return the penalty of the violations, summed over all dyads (K, T)."""
         return weight * (self.cosines.sum(0) + self.far.sum((0, 1)))
 
 
 def _joints(at: DyadPositions) -> np.ndarray:
+    """Return the joints P, Q and R of all dyads, complex (3, D, K, T)."""
     return np.stack([at.origins[BASE::2], at.origins[BASE + 1 :: 2], at.ends])
 
 

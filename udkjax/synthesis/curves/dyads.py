@@ -39,7 +39,7 @@ class Topology(NamedTuple):
     ratio: np.ndarray
 
     def take(self, which: Any) -> "Topology":
-        """Return some of the linkages."""
+        """Return the selected linkages."""
         return Topology(*(a[which] for a in self))
 
     @property

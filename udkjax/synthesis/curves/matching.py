@@ -54,7 +54,7 @@ def find_starts(
 
 
 def _parts(wanted: WantedCurve) -> list[np.ndarray]:
-    """Return the target by as many points as each part has; an open one also forth and back, for a whole turn."""
+    """Return the target sampled at as many points as each part has; an open target runs forth and back, for a whole turn."""
     if wanted.is_closed:
         return [resampled(wanted.points, POINTS, True)]
     there = wanted.points

@@ -102,7 +102,7 @@ class WantedCurve:
         self.length = float(np.abs(np.diff(resampled(self.points, CHAMFER_POINTS + 1))).sum())
 
     def target(self, count: int) -> CurveTarget:
-        """Return the curve by `count` points."""
+        """Return the curve resampled at `count` points."""
         z = resampled(self.points, count, self.is_closed)
         following, previous = np.roll(z, -1), np.roll(z, 1)
         if not self.is_closed:

@@ -53,7 +53,7 @@ def scene_changes(
 
 
 class _ChangingScene(NamedTuple):
-    """The part of `SceneChanges` that does not depend on the run."""
+    """The part of `SceneChanges` that is the same for all runs."""
 
     switches: tuple[int, ...]  # without locks of joints that stick
     adding: tuple[int, ...]  # the events of the joints that events add

@@ -86,7 +86,7 @@ class Contacts(NamedTuple):
 
 
 class ContactRows(NamedTuple):
-    """The rows of all conditions, projected by the constraints."""
+    """Rows of E conditions, projected by the constraints: their mobilities W, and the velocities that unit impulses give."""
 
     W: Float[Any, "*m E E"]
     directions: Float[Any, "*m E n"]  # M^(-1/2) u: the velocities that unit impulses give
@@ -94,7 +94,7 @@ class ContactRows(NamedTuple):
 
 
 class Impulses(NamedTuple):
-    """The results of an impact."""
+    """Results of an impact: the impulses, the rates of the conditions after it, and whether contacts still penetrate."""
 
     impulse: Float[Any, "*m E"]  # in the unit of M v over that of the condition's derivative with respect to q: N s of a gap
     rate: Float[Any, "*m E"]  # g_dot+
@@ -102,7 +102,7 @@ class Impulses(NamedTuple):
 
 
 class KnownContacts(NamedTuple):
-    """The contacts at an event of a run that is differentiated: as they were found when it ran."""
+    """States of the contacts at an event, as the run found them; its derivatives reuse them."""
 
     closed: Int[Any, "*m E"]  # OPEN, TOUCHES or SLOW
     held: Bool[Any, "*m E"]  # after the event
@@ -302,8 +302,8 @@ def hit_contacts(
             solution = solve_complementarity(W, pull, stays, pressed, xp)
             return solution.passive & (solution.x > 0), xp.abs(solution.y) <= weak
 
-        # A pressed contact that rises so slowly is at rest, too: the impact is one without its rebound, and without that of
-        # contacts that depend on it. It may still rise, lifted by other contacts, and is then let go.
+        # A pressed contact that rebounds more slowly than `slow` comes to rest: the impact is computed again without the
+        # rebounds of this contact and of contacts that depend on it. If other contacts then lift it, it is not held.
         presses, idle = pressed_and_idle(stays)
         rises = xp.any(presses & (stop(impact.rate) > still), axis=-1, keepdims=True)
         if xp is not np or rises.any():

@@ -32,7 +32,7 @@ from udkjax.transforms.gradients import stop_gradients
 
 
 class JumpResult(NamedTuple):
-    """The states of members after an event."""
+    """States of b members after an event, their contacts, and a `Result` for each."""
 
     state: RunState
     contacts: ContactChanges | None  # None if no event is an impact

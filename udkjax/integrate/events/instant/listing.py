@@ -17,7 +17,7 @@ STICKS, SLIPS, TURNS = range(3)
 
 
 class Kinks(NamedTuple):
-    """The kinks of the forces in a run."""
+    """Number of kinks of the forces in a run, and the time (s) from which they are no longer located."""
 
     count: Int[Array, ""]
     unlocated: Float[Array, ""]  # the time from which they are not located (s); else infinite

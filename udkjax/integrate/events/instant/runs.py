@@ -79,7 +79,7 @@ def shapes_of_run(plan: EventPlan, T: int, n: int, room: int) -> EventRun:
 
 
 class MemberRuns(NamedTuple):
-    """Everything that changes in runs."""
+    """State of B runs that the loop over windows and events updates."""
 
     t: Float[Any, "B"]
     q: Float[Any, "B n"]

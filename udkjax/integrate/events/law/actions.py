@@ -73,10 +73,10 @@ class Action(PrintsLine):
         return None
 
     def check(self, mechanism: Any, where: str):
-        """Raise an error, whose message begins with `where`, if its arguments do not fit a model."""
+        """Return the name of the joint that the action adds, and the joint without numbers that follow from the state."""
 
     def has_usable_numbers(self) -> Bool[Array, ""]:
-        """Return whether its numbers, which may be traced, are within their limits."""
+        """Return True if the numbers of the action, which may be traced, are within their limits."""
         return jnp.array(True)
 
 

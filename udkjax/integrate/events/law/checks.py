@@ -29,7 +29,7 @@ def require_vector(name: str, value: Any) -> None:
 
 
 def require_normal(name: str, value: Any) -> None:
-    """Raise if a normal is zero."""
+    """Raise `ValueError` if a normal is the zero vector; a traced one is not checked."""
     require_vector(name, value)
     if not isinstance(value, Tracer) and not np.any(np.asarray(value)):
         raise ValueError(f"{name} must not be zero: it points to the side that is allowed")
@@ -43,7 +43,7 @@ def require_restitution(name: str, value: Any) -> None:
 
 
 def require_friction(where: str, coefficient: Any, static_coefficient: Any, at_rest: str) -> None:
-    """Raise unless the coefficients of friction of a contact are numbers that are not negative, and it rests."""
+    """Raise `ValueError` if coefficients of friction are negative or contradict each other, or `at_rest` is not "hold"."""
     for name, value in (("coefficient", coefficient), ("static_coefficient", static_coefficient)):
         if value is None:
             continue

@@ -1,4 +1,4 @@
-"""The part of runs with events that does not depend on numbers: what they do to the phases, and kinds of the events."""
+"""The static part of runs with events: the phases to which events lead, and masks of the kinds of events."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -37,12 +37,12 @@ class EventPlan:
 
     @cached_property
     def kinks(self) -> Bool[np.ndarray, "E"]:
-        """Mask of the events that turn a side."""
+        """Mask of the events at kinks, which change the side of a comparison."""
         return np.array([x is not None for x in self.turns], bool)
 
     @cached_property
     def side_of(self) -> Int[np.ndarray, "E"]:
-        """The side that an event turns; 0 for those that turn none."""
+        """Index of the side that an event changes; 0 for events that change none."""
         return np.array([0 if x is None else x[0] for x in self.turns], int)
 
     @cached_property
@@ -61,12 +61,12 @@ class EventPlan:
 
     @property
     def has_kinks(self) -> bool:
-        """True if sides belong to kinks."""
+        """True if some sides are those of kinks, not of joints that stick."""
         return self.side_count > self.first_kink_side
 
     @property
     def room(self) -> int:
-        """The largest number of events with all kinks."""
+        """Largest number of recorded events: `max_events`, plus `MOST_KINKS` if forces have kinks."""
         return self.max_events + (MOST_KINKS if self.has_kinks else 0)
 
     @property
@@ -149,7 +149,7 @@ class EventPlan:
 
     @cached_property
     def forwards(self) -> Int[np.ndarray, "F"]:
-        """The event of each joint that slides in the positive direction; that of the other direction follows."""
+        """Index of the event at which each joint slides in the positive direction; that of the negative direction is the next."""
         return np.array([x.event for x in self.sticking], int)
 
     @cached_property

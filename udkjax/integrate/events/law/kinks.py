@@ -170,7 +170,7 @@ def _smooth_forces(mechanism: Mechanism) -> Iterator[tuple[str, SmoothLoads, boo
 
 
 def with_held_forces(model: Any, first: int = 0) -> tuple[Any, tuple[HeldElement, ...], tuple[Event, ...]]:
-    """Return a model with held loads, what these are, and the events at which their sides turn; without kinks, itself.
+    """Return a model with held loads, the held elements, and the events at which their sides change; itself without kinks.
 
     `first` is the number of other sides, which come first.
     """
@@ -240,14 +240,14 @@ def renewed_sides(elements: Sequence[HeldElement], model: Any, t: Any, q: Any, v
 
 
 class KinkPlaces(NamedTuple):
-    """Places among the numbers of events."""
+    """Indices of the numbers of kinks among the numbers of all events."""
 
     sides: tuple[tuple[int, int], ...]  # each with the index of its side
     elements: tuple[tuple[int, ...], ...]  # of the numbers of each force, without sides
 
 
 def places_of_kinks(events: Sequence[Event], held: Sequence[HeldElement]) -> KinkPlaces:
-    """Return the positions of the numbers of kinks among the numbers of all events."""
+    """Return the indices of the numbers of kinks among the numbers of all events."""
     sizes = [sum(map(np.size, jax.tree.leaves(eqx.filter(e, eqx.is_inexact_array)))) for e in events]
     starts, first = np.cumsum([0, *sizes]), len(events) - sum(len(x.smooth.turns) for x in held)
     sides, elements = [], []

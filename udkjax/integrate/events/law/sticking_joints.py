@@ -84,7 +84,7 @@ class StickingJoint(NamedTuple):
 
 
 class Sticking(NamedTuple):
-    """A mechanism with directed frictions."""
+    """A mechanism with directed friction, its joints that may stick, and the events of these joints."""
 
     mechanism: Any
     joints: tuple[StickingJoint, ...]

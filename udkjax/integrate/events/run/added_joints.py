@@ -16,7 +16,7 @@ from udkjax.scene.mechanism import Mechanism
 
 
 class AddedJoint(NamedTuple):
-    """A joint that an event adds."""
+    """A joint that an event adds, as a program that computes its numbers."""
 
     program: ScalarProgram  # computes all numbers of the joint from q and its constant numbers
     changing: tuple[int, ...]  # indices of the numbers that depend on q

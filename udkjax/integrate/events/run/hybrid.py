@@ -37,7 +37,7 @@ Condition = Callable[[Float[Array, ""], Float[Array, "n"], Float[Array, "n"]], F
 
 
 class Hybrid(eqx.Module):
-    """All numbers and choices of a run with events."""
+    """A run with events as a pytree: the phases of the mechanism, events, output times, initial state and tolerances."""
 
     phases: Phases
     events: tuple[Event, ...]
@@ -157,14 +157,14 @@ class Hybrid(eqx.Module):
         return jax.lax.switch(self.plan.is_first(phase).astype(int), branches, *arguments)
 
     def textbook(self, which: int, at: RunState) -> Any:
-        """Return the equations of a phase, of the mechanism `which`, solved by SVD."""
+        """Return the equations, solved by SVD, of the mechanism `which` (SCENE or SWITCHED) in the phase of a state."""
         mechanism = self.phases.mechanism(which, at.phase, at.joints)
         return equations_of(mechanism, SVD(), self.baumgarte, analysis=self.phases.analyses[which])
 
     # --- conditions
 
     def conditions(self, added: Added) -> Condition:
-        """Return the conditions of all events as a function of t, q and v, for the sides that comparisons have."""
+        """Return the conditions of all events as a function of t, q and v; comparisons in forces have the sides in `added`."""
         events = with_sides(self.events, added[-1], self.phases.held)
         return lambda t, q, v: conditions_of(events, self.names, t, q, v)
 
@@ -174,7 +174,7 @@ class Hybrid(eqx.Module):
         return lambda t, q, v: rate_along(conditions, t, q, v, jnp.zeros_like(v))
 
     def turned(self, at: RunState, k: Int[Array, ""]) -> Float[Array, "S"]:
-        """Return the sides after event k at a state."""
+        """Return the sides of the comparisons in forces (S,) after event k at a state."""
         factor, shift = (jnp.asarray(x)[k] for x in self.plan.side_changes)
         sides = at.joints[-1] * factor + shift
         return stop_gradients(renewed_sides(self.phases.held, self.phases.mechanisms[SCENE], at.t, at.q, at.v, sides))

@@ -35,7 +35,7 @@ TIGHTER, TIGHTEST = 1e-3, 1e-12
 
 
 class MachinePlan(NamedTuple):
-    """The part of runs by machine code that does not depend on numbers; hashable."""
+    """The static part of runs by machine code; hashable."""
 
     events: EventPlan
     phases: tuple[PhasePlan, ...]
@@ -44,7 +44,7 @@ class MachinePlan(NamedTuple):
 
 
 class MemberUnits(NamedTuple):
-    """Numbers of each member (B,)."""
+    """Characteristic units of each of B members, and its tolerance of drift."""
 
     rate: Any  # characteristic rate of the system and the run (1/s)
     length: Any  # (m)
@@ -132,7 +132,7 @@ class MachineSystem:
         yield from ((which, here) for which, here in ((SCENE, is_first), (SWITCHED, ~is_first)) if here.any())
 
     def add_joints(self, members: MemberIndices, new: Bool[np.ndarray, "b A"], q: np.ndarray, joints: Any) -> Any:
-        """Return the numbers of the joints that events have added, with new ones, added at q."""
+        """Return the numbers of the joints that events have added; masked `new` ones are added at positions q."""
         indices, start = self._all if members is None else members, 0
         for joint, numbers, here in zip(self._added, joints[:-1], new.T, strict=True):
             count = len(joint.program.inputs) - q.shape[1]
@@ -143,7 +143,7 @@ class MachineSystem:
         return joints
 
     def sides(self, members: MemberIndices, joints: Any) -> Float[np.ndarray, "b S"]:
-        """Return the sides of comparisons of members."""
+        """Return the sides of the comparisons in forces of members (b, S): the last numbers of `joints`."""
         return take(joints[-1], members)
 
     def with_sides(self, members: MemberIndices, joints: Any, sides: Float[np.ndarray, "b S"]) -> Any:
@@ -157,7 +157,7 @@ class MachineSystem:
         return self._renew(members, at, self.sides(members, at.joints) * factor[k] + shift[k])
 
     def first_sides(self, at: RunState) -> Float[np.ndarray, "B S"]:
-        """Return the sides of all members at the start."""
+        """Return the sides of the comparisons in forces of all members at the start (B, S)."""
         unknown = np.full_like(at.joints[-1], FREE)
         unknown[:, : self.plan.first_kink_side] = 0.0
         return self._renew(None, at, unknown)

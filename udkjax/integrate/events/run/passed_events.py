@@ -18,7 +18,7 @@ from udkjax.native.watching.conditions import Conditions
 
 
 class NumberPlaces(NamedTuple):
-    """Places among the numbers of a mechanism."""
+    """Indices among the numbers of a mechanism: those of sides, of added joints, of switches and of marks."""
 
     sides: tuple[int, ...]  # of all sides; -1: the mechanism lacks the force
     joints: Sequence[tuple[int, ...]] = ()  # of the numbers of each joint that events add
@@ -29,7 +29,7 @@ class NumberPlaces(NamedTuple):
 def passed_events(
     plan: EventPlan, phases: Phases, conditions: Conditions, of_kinks: KinkPlaces, added: Sequence[AddedJoint], at: NumberPlaces
 ) -> dict[str, Any]:
-    """Return the events that runs of a mechanism pass, as arguments of `RunStates.watching`; nothing if there are none.
+    """Return the events that runs of a mechanism pass, as arguments of `RunStates.watching`; empty if there are none.
 
     Args:
         plan: the events.
@@ -95,21 +95,22 @@ def _slides(plan: EventPlan, conditions: Conditions, added: Sequence[AddedJoint]
 def _numbers_of_locks(
     plan: EventPlan, locks: Sequence[dict[str, Any]], added: Sequence[AddedJoint], at: NumberPlaces
 ) -> list[tuple[int, str, int]]:
-    """Return the places of the numbers of locks, in the order of `Sliding.lock_count`."""
-    F, found, start = len(locks), [], 2 * len(locks)
-    for j, (switch, joint) in enumerate(zip(plan.locks, added[len(added) - F :], strict=True)):
+    """Return which numbers of the mechanism are numbers of locks: triples (index, "locks", index as in `Sliding.lock_count`)."""
+    lock_count, found = len(locks), []
+    first_lock = len(added) - lock_count  # locks are the last joints that events add
+    start = 2 * lock_count  # numbers of locks: first all switches, then all marks of rows, then numbers that depend on q
+    for j, (switch, joint) in enumerate(zip(plan.locks, added[first_lock:], strict=True)):
         found += [(place, "locks", j) for place, of_switch in at.switches if of_switch == switch]
         if at.first_mark >= 0:
-            found.append((at.first_mark + plan.switches.rows[plan.forwards[j]], "locks", F + j))
-        places = at.joints[len(added) - F + j]
-        changing = joint.changing
-        found += [(places[i], "locks", start + k) for k, i in enumerate(changing)]
-        start += len(changing)
+            found.append((at.first_mark + plan.switches.rows[plan.forwards[j]], "locks", lock_count + j))
+        places = at.joints[first_lock + j]
+        found += [(places[i], "locks", start + k) for k, i in enumerate(joint.changing)]
+        start += len(joint.changing)
     return found
 
 
 def put_locks(plan: EventPlan, added: Sequence[AddedJoint], joints: Any, members: Any, locks: Float[np.ndarray, "b L"]):
-    """Put the numbers of locks, as runs return them, into those of all joints that events have added."""
+    """Copy the numbers of locks (b, L), as runs return them, into `joints`, the numbers of all joints that events have added."""
     start, first = 2 * len(plan.sticking), len(added) - len(plan.sticking)
     for numbers, joint in zip(joints[first:-1], added[first:], strict=True):
         places = joint.changing
@@ -118,7 +119,7 @@ def put_locks(plan: EventPlan, added: Sequence[AddedJoint], joints: Any, members
 
 
 class PassedEvents(NamedTuple):
-    """The events that runs have passed, K at most."""
+    """The events that b runs have passed, at most K in each."""
 
     locks: Float[np.ndarray, "b L"]  # the numbers of all locks at the end
     count: Int[np.ndarray, "b"]

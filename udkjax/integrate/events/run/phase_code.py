@@ -284,7 +284,7 @@ class PhaseCode:
         return results[:, :n].copy(), results[:, n:-1].copy(), results[:, -1].copy()
 
     def _put_sides(self, numbers: np.ndarray, members: Int[np.ndarray, "b"]):
-        """Put the sides of comparisons into the numbers of events."""
+        """Put the sides of the comparisons in forces into the numbers of events."""
         for place, side in self.plan.sides_of_events:
             numbers[:, place] = self._joints[members, self._first_side + side]
 

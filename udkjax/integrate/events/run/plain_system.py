@@ -89,15 +89,15 @@ class PlainSystem:
         return (*chosen, sides)
 
     def sides(self, members: MemberIndices, joints: Added) -> Float[Array, "1 S"]:
-        """Return the sides of comparisons."""
+        """Return the sides of the comparisons in forces (1, S): the last entry of `joints`."""
         return joints[-1][None]
 
     def with_sides(self, members: MemberIndices, joints: Added, sides: Float[Array, "1 S"]) -> Added:
-        """Return the joints that events have added, with other sides."""
+        """Return `joints` with other sides of the comparisons in forces, their last entry."""
         return (*joints[:-1], sides[0])
 
     def turned(self, members: MemberIndices, k: Int[Array, "1"], at: RunState) -> Float[Array, "1 S"]:
-        """Return the sides after event k."""
+        """Return the sides of the comparisons in forces (1, S) after event k."""
         return self.hybrid.turned(without_member(at), k[0])[None]
 
     def when(self, mask: Bool[Array, "1"], change: Change, runs: MemberRuns) -> MemberRuns:
@@ -109,7 +109,7 @@ class PlainSystem:
         return jax.lax.while_loop(lambda runs: runs.running[0], change, runs)
 
     def advance(self, runs: MemberRuns, members: MemberIndices) -> MemberRuns:
-        """Integrate a window."""
+        """Integrate the next window, or the part of it in which all crossings are certain."""
         watched = self.plan.watched(runs.phase, runs.carried, jnp)[0]
         state = without_member(runs.state(None))
         end = advance_window(

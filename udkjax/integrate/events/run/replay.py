@@ -50,14 +50,14 @@ def hybrid_plan(fixed: "FixedPart") -> EventPlan:
 
 
 class FixedPart(eqx.Module):
-    """The part of a system that is not numbers."""
+    """Everything in a `Hybrid` except its numbers."""
 
     rest: PyTree
     tree: TreeDef = eqx.field(static=True)
     conditions: Conditions | None = eqx.field(static=True)
 
     def combine(self, xs: Sequence[Array]) -> Hybrid:
-        """Return the system with these numbers."""
+        """Return the `Hybrid` with these numbers."""
         return eqx.combine(jax.tree.unflatten(self.tree, xs), self.rest)
 
 

@@ -43,7 +43,7 @@ class Window(NamedTuple):
 
 
 class WindowUnits(NamedTuple):
-    """Numbers of a run, for one member."""
+    """Units and tolerances that windows need, for one member."""
 
     rate: Any  # characteristic rate of the system and the run (1/s)
     scene_rate: Any  # (1/s)
@@ -53,7 +53,7 @@ class WindowUnits(NamedTuple):
 
 
 class WatchedConditions(NamedTuple):
-    """The conditions that a window watches."""
+    """Conditions and forces (2E) that a window watches: the last side of zero of each, and the scales of the conditions."""
 
     sides: Int[Any, "2E"]  # the last side of zero of each condition, and of each force
     scale: Float[Any, "E"]

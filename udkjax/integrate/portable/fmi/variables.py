@@ -30,7 +30,7 @@ POSES = ("position", "angle", "velocity", "angular_velocity")  # of a body: the 
 
 
 class FMUVariable(NamedTuple):
-    """A variable: a number."""
+    """A variable of an FMU: a number with its name and unit, and its value at the start."""
 
     name: str
     unit: str
@@ -38,7 +38,7 @@ class FMUVariable(NamedTuple):
 
 
 class MeasuredState(NamedTuple):
-    """A motion of one state."""
+    """A state as a motion with one output time, so that channels can measure it."""
 
     ts: Array
     q: Array
@@ -111,7 +111,7 @@ class FMUVariables:
 
 
 def _channels(mechanism: Mechanism, names: Sequence[str] | None, known: Collection[str]) -> list[Channel]:
-    """Return the channels of further outputs; None: positions and velocities of all pins that move."""
+    """Return the channels of the requested outputs that are not `known`; None: positions and velocities of all moving pins."""
     if names is None:
         found = [channel_of(mechanism, name) for name in channels_of(mechanism) if name.startswith("pin.")]
         return [x for x in found if x.needs == "states" and x.bodies != (GROUND,)]

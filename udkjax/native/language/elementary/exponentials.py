@@ -35,7 +35,7 @@ class Reduced(NamedTuple):
 
 
 def reduce(f: Function, x: Value, low: Value | None = None) -> Reduced:
-    """Write e^(x + low), for |low| < 2^-20."""
+    """Reduce e^(x + low), |low| < 2^-20, to 2^n e^r, with n the nearest integer to x / log 2."""
     number, n = nearest(f, x, 1.0 / LOG2)
     high = f.fma(number, -LOG2_PARTS[0], x)
     r = f.fma(number, -LOG2_PARTS[1], high if low is None else high + low)
@@ -79,7 +79,7 @@ def exp2(f: Function, x: Value) -> Value:
 
 
 def _quarter_expm1(f: Function, x: Value) -> tuple[Value, Value]:
-    """Return (e^x - 1) / 4, which does not overflow, in two parts, for -40 < x < 710.7."""
+    """Return (e^x - 1) / 4, which does not overflow, as a sum of two doubles, for -40 < x < 710.7."""
     e = reduce(f, x)
     size = power_of_two(e.n - 2)
     whole, part = size - 0.25, rounded(size * e.high)

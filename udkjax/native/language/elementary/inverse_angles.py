@@ -28,7 +28,7 @@ BEYOND = 2.0**70  # the arctangent of larger numbers rounds to pi / 2
 
 
 def _arc(f: Function, numerator: Value, denominator: Value) -> tuple[Value, Value]:
-    """Return atan(numerator / denominator) in two parts, for 0 <= numerator <= denominator."""
+    """Return atan(numerator / denominator) as a sum of two doubles, for 0 <= numerator <= denominator."""
     middle, above = numerator >= rounded(denominator * FIRST_EDGE), numerator >= rounded(denominator * SECOND_EDGE)
     factor = f.select(above, 1.0, f.select(middle, 0.5, 0.0))
     top = f.fma(factor, -denominator, numerator)
@@ -44,7 +44,7 @@ def _arc(f: Function, numerator: Value, denominator: Value) -> tuple[Value, Valu
 
 
 def _less(f: Function, mask: Value, constant: tuple[float, float], high: Value, low: Value) -> tuple[Value, Value]:
-    """Return constant - (high + low) where `mask` holds, and high + low elsewhere, in two parts."""
+    """Return constant - (high + low) where `mask` holds, and high + low elsewhere, as a sum of two doubles."""
     new = constant[0] - high
     rest = constant[0] - new - high + (constant[1] - low)
     return f.select(mask, new, high), f.select(mask, rest, low)

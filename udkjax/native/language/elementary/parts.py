@@ -87,7 +87,7 @@ def polynomial(x: Value, coefficients: Sequence[float]) -> Value:
 
 
 def quotient(f: Function, a: tuple[Operand, Operand], b: tuple[Value, Operand]) -> tuple[Value, Value]:
-    """Return a / b in two parts, for numbers in two parts."""
+    """Return a / b as a sum of two doubles, for numbers that are such sums."""
     inverse = 1.0 / b[0]
     result = rounded(inverse * a[0])
     error = f.fma(-result, b[0], a[0]) - f.fma(result, b[1], -a[1])

@@ -66,7 +66,7 @@ def _unusual_power(f: Function, x: Value, y: Value, result: Value) -> Value:
 
 
 def _log2(f: Function, size: Normal) -> tuple[Value, Value]:
-    """Return log2 of positive numbers in two parts."""
+    """Return log2 of positive numbers as a sum of two doubles."""
     exponent, m = size.mantissa(ONE)
     above, middle = m >= SQRT3, m >= SQRT_THREE_HALVES
     is_shifted = middle & ~above  # compared with 3/2, otherwise with one

@@ -38,7 +38,7 @@ class Residuals(NamedTuple):
 
     @property
     def row_numbers(self) -> Int[np.ndarray, "R"]:
-        """The rows of the problem that these are."""
+        """The indices of these rows among those of the problem."""
         return np.arange(self.r.shape[1]) if self.rows is None else self.rows
 
 
@@ -95,7 +95,7 @@ class Reduction:
 
 
 def reduce_blocks(blocks: Iterable[Residuals]) -> Reduction | None:
-    """Return the reduced rows of the first set of unknowns; None, without those that follow, if some cannot be computed."""
+    """Return the reduced rows of the first set of unknowns; None at the first block that cannot be computed."""
     reduction = None
     for block in blocks:
         if not block.ok[0]:

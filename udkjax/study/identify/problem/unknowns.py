@@ -248,7 +248,7 @@ def conditions_of(mechanism: StudyModel, records: Sequence[Record]) -> dict[str,
 
 
 def _held_in_scene(mechanism: Any, samples: NumberField | None) -> Held | None:
-    """Return the `Held` of these samples, if that is what they are."""
+    """Return the `Held` that contains the samples; None if they are those of no `Held` of the scene."""
     holder = samples.holder(mechanism.groups) if samples is not None and mechanism.has_bodies else None
     return holder if isinstance(holder, Held) else None
 

@@ -184,7 +184,7 @@ class Record:
 
 
 def _mistakes_of_kind(values: object, t0: object, conditions: object) -> Iterator[str]:
-    """Iterate over the arguments of a record that are of another kind than they must be."""
+    """Iterate over the mistakes in the types of the arguments of a record."""
     if not isinstance(values, Mapping):
         yield f"values: must map channels to numbers, {describe(values)}"
     try:

@@ -67,7 +67,7 @@ class RegularizedProblem:
             yield robust(block, partial(huber, c=HUBER_LIMIT), len(self.noise))
 
     def plain(self, z: Float[np.ndarray, "B K"], tol: TolerancePair, horizon: float | None = None) -> Iterator[Residuals]:
-        """Compute the same without Huber's loss."""
+        """Compute residuals and Jacobian as `row_blocks`, without Huber's loss."""
         scale, K = np.append(1.0 / self.noise, np.ones(self.problem.extra_rows)), len(self.guess)
         for block in self.problem.row_blocks(z, tol, horizon):
             of_block = scale[block.row_numbers]
