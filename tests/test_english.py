@@ -65,6 +65,9 @@ BEGINNINGS = [
     (r"That\b", "That of the bodies.", "The frame of the bodies."),
     (r"Whether\b", "Whether it is finite.", "True if it is finite."),
     (r"How\b", "How many there are.", "Number of bodies."),
+    (r"Do nothing\.?$", "Do nothing.", "Do nothing: an evaluation sets `rank`."),
+    (r"Return those of\b", "Return those of chunk k.", "Return the random numbers of chunk k."),
+    (r"(?:[A-Z][a-z]+){2,} (of|on|between)\b", "PosesAndRates of a body.", "Poses of a body."),
 ]
 # Pattern of any text: likewise.
 PHRASES = [
@@ -92,6 +95,25 @@ PHRASES = [
     (r"\bnone to (see|be)\b", "no cause, if there is none to see", "there is none"),
     (r"\bwritten out\b", "small matrices, written out", "The loops are unrolled."),
     (r"\bis said by\b", "A wrong threshold is said by its result.", "It is said to be exact."),
+    (r"\bbase of both\b", "The base of both modes.", "Base of forward and reverse mode."),
+    (r"(?<!are )\bin two parts\b", "the logarithm in two parts", "a sum of two doubles; they are two parts of one force"),
+    (
+        r"\b(the rates that|what rates) are left\b",
+        "the state, and the rates that are left",
+        "the largest remaining row of Psi_dot",
+    ),
+    (r"\bwhat is left (of|out)\b", "and what is left out of balance", "and the unbalanced part"),
+    (r"\b(with|about|for|each`?) so many (members|bytes|of)\b", "about so many of the draws", "about `draws` draws"),
+    (r"\b(not|are|is) worth it\b", "None if that is not worth it", "None until compiling pays off"),
+    (r"\bas (a|the) course (asks|counts|says)\b", "the angle as a course counts it", "as textbooks count it"),
+    (r"\bas (it was|they were) found when\b", "contacts as they were found when it ran", "contacts as the run found them"),
+    (
+        r"\bpart of a \w+ that is not (numbers|a number)\b",
+        "The part of a system that is not numbers.",
+        "Everything except its numbers.",
+    ),
+    (r"\binstead of these\.", "the shapes of its arrays instead of these.", "shapes in place of the arrays."),
+    (r"\bmove alike\b", "the point at which two links move alike", "the point with the same velocity"),
     (r"\bcounts? as (it is|they are) drawn\b", "Angles count as they are drawn.", "Angles are those of the drawing."),
 ]
 

@@ -49,7 +49,7 @@ MOTORS = {
 def calls_of(question):
     """Return how many functions are called when a question is asked for the 100th time, or one of the next two times.
 
-    One of the three may generate a function that is worth it by now.
+    One of the three may generate a function, which pays off by now.
     """
     for _ in range(99):
         question()

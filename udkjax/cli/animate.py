@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from udkjax import Mechanism
     from udkjax.show.player.marks.measure_curves import ShownMotion
 
-    ShownRun = tuple[Mechanism, ShownMotion, dict[str, np.ndarray]]  # with further measures by name
+    ShownRun = tuple[Mechanism, ShownMotion, dict[str, np.ndarray]]  # the last entry: further measures by name
 
 ANIMATION_SUFFIXES = (".html", ".gif", ".mp4", ".svg", ".png", ".dxf")
 Files = Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN.nc|SCENE.toml|NAME")]

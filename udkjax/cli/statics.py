@@ -37,7 +37,7 @@ def statics(
     from udkjax.positions.assembling.channels import LOADS
     from udkjax.statics.resting_forces import force_lines, resting_forces
 
-    if starts == 1:  # without one nearby, that downhill, as in the studio
+    if starts == 1:  # the equilibrium nearby, or else a stable one downhill from the guess, as in the studio
         tried = (udk.equilibrium(mech, t=t, stable=x) for x in ([True] if stable else [False, True]))
         equilibria = [x for x in tried if x.balanced][:1]
     else:

@@ -224,7 +224,7 @@ def _rates(law: _ImpactLaw, b: Any, least: Any, slides: Any, closed: Any) -> tup
     q = xp.concatenate([rows @ (b0 + W0 @ known), mu * least0[law.of_rows]])
     passive, is_solved = general_complementary_set(M, q, xp.concatenate([may_press, at_rest, at_rest, at_rest]), xp)
     presses, forwards, backwards, limited = (passive[k : k + n] for k, n in ((0, N), (N, F), (N + F, F), (N + 2 * F, F)))
-    limited = limited & ~(forwards & backwards)  # both: one combination of the same force
+    limited = limited & ~(forwards & backwards)  # if both are positive, they are two parts of one force
     sticks = at_rest & ~limited & (forwards | backwards)
     direction = xp.where(at_rest, xp.where(limited, 1.0 * backwards - 1.0 * forwards, 0.0), slides)
 

@@ -81,8 +81,8 @@ class Response(NamedTuple):
 class ContactsAtRest(NamedTuple):
     """Contacts (E) at one instant; some of them belong to joints that rub in them."""
 
-    of_joints: Int[np.ndarray, "F"]  # the contact of each joint; -1: it is no contact
-    held: Bool[Any, "*m E"]  # at first
+    of_joints: Int[np.ndarray, "F"]  # the contact of each joint; -1: the joint is not in a contact
+    held: Bool[Any, "*m E"]  # whether each contact is held before the search for modes
     may_change: Bool[Any, "*m E"]  # contacts that do not separate, which may be held or not
     unit: Any  # size of second rates that are not zero (*m, E)
     most: int  # the largest number of contacts that may change
@@ -132,19 +132,21 @@ class Decision(NamedTuple):
 
     modes: FrictionModes
     failed: Bool[Any, "*m"]  # whether no modes were found that obey the law
-    by_contacts: Bool[Any, "*m"]  # whether contacts violated their law in the last ones
+    by_contacts: Bool[Any, "*m"]  # whether contacts violated their law in the last modes tried
 
 
 class _Pivot(NamedTuple):
+    """State of the search for modes by principal pivots, one change at a time."""
+
     modes: FrictionModes  # as they follow from the other fields
-    held: Any  # contacts
+    held: Any  # (E,): whether each contact is held
     within: Any  # whether the force of a joint at rest is within its limit
     departs: Any  # whether others move a joint that is at rest only at this instant
-    direction: Any
-    steps: Any
+    direction: Any  # (F,): direction of sliding, or of the limit that is reached
+    steps: Any  # number of pivots so far
     done: Any
     failed: Any
-    by_contacts: Any  # whether a contact is held wrongly, or not
+    by_contacts: Any  # whether a contact is held that pulls, or not held that would be penetrated
 
 
 class JointsAtRest(NamedTuple):
@@ -152,10 +154,12 @@ class JointsAtRest(NamedTuple):
 
     rest: Bool[Any, "*m F"]  # whether their speeds are zero
     sliding: Float[Any, "*m F"]  # the directions of all others
-    W: Float[Any, "*m F F"]  # accelerations of joints at unit forces of others, rows of unit size; zero where nothing can move
+    W: Float[
+        Any, "*m F F"
+    ]  # mobilities: accelerations of joints at unit forces of others, rows of unit size; zero where nothing can move
     size: Float[Any, "*m F"]  # roots of the accelerations at unit forces: the units of W
-    locked: Bool[Any, "*m F"]  # before
-    rested: Bool[Any, "*m F"]  # before, locked or kept at rest by others
+    locked: Bool[Any, "*m F"]  # whether the joint was locked before
+    rested: Bool[Any, "*m F"]  # whether the joint was at rest before, locked or kept at rest by others
     unit: Float[Any, "*m F"]  # size of accelerations that are not zero
     contacts: ContactsAtRest
 
@@ -280,7 +284,7 @@ class JointsAtRest(NamedTuple):
             pivot = pivot._replace(failed=pivot.failed | fails, done=pivot.done | fails)
             return pivot, ~pivot.done
 
-        # After an event of one joint the others keep their modes, or nearly so: pivots begin with these.
+        # After an event of one joint, most other joints keep their modes: the search by pivots begins with these modes.
         at_once = xp.sum(self.rest & ~self.rested, axis=-1) > 1
         none = FrictionModes(self.rest, direction, self.rest, self.rest, contacts.held)  # replaced at once
         no = is_settled & False

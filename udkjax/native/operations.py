@@ -66,7 +66,7 @@ class Operation(ABC):
 
     @property
     def later(self) -> "Operation | None":
-        """The operation whose module runs the members that leave this one's; None if none leaves."""
+        """The operation to whose module members may leave; None if they never leave."""
         return None
 
     @abstractmethod
@@ -191,7 +191,7 @@ class ProjectStates(StateOperation):
 
 
 class ProjectJump(StateOperation):
-    """Project states after events onto the constraint manifold, and return what is left of their rates."""
+    """Project states after events onto the constraint manifold, and return the largest remaining row of Psi_dot per scale."""
 
     function = StateJump
 

@@ -103,8 +103,9 @@ def _wait_for(calls: Sequence[Future[Any]]) -> None:
 class LoadedCode:
     """The machine code of one operation in `width` lanes.
 
-    If members leave for the module of a later operation, its code is loaded at the same level of optimization, and called directly
-    from then on.
+    If members leave for the module of a later operation, its code is loaded at the same level of optimization, and from then on
+    called directly.
+
     First calls use quickly compiled code, which runs slowly: only calls with few members and steps, and only until they have
     taken a tenth of the time of compiling optimized code. Both codes round equally.
     """

@@ -23,7 +23,7 @@ GIVEN_RECORD, GIVEN_STEPS = 5, 6  # places of the record and of the number of st
 
 
 def are_stored(inputs: Sequence[Any], operation: Operation, members: int, on_card: bool = False) -> bool:
-    """Return whether a pass of reverse mode with so many members stores or reads records; True for other operations."""
+    """Return whether a pass of reverse mode over this number of members stores or reads records; True for other operations."""
     if not isinstance(operation, RunCotangents):
         return True
     if goes_back(inputs) and math.prod(inputs[-GIVEN_RECORD].shape[:-1]) == 1:  # all members share it

@@ -83,7 +83,7 @@ class Balance(NamedTuple):
 def reactions_at(
     mechanism: Mechanism, analysis: Analysis, t: Time, q: Float[Array, "n"], row: int = 0
 ) -> tuple[Reactions, "Balance"]:
-    """Return the equilibria of a position at rest, and what is left out of balance.
+    """Return the equilibria of a position at rest, and the unbalanced part of the loads.
 
     Args:
         mechanism: the mechanism, with a driver for the coordinate.

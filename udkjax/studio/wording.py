@@ -50,7 +50,7 @@ UNKNOWN = "this cannot be computed for the drawing as it is: go back to an earli
 
 
 def studio_words(message: str) -> str:
-    """Return a message of the package as the studio says it."""
+    """Return a message of the package in the words of the studio."""
     for pattern, words in WORDS.items():
         message = re.sub(pattern, words, message)
     if PYTHON.search(message):
@@ -59,7 +59,7 @@ def studio_words(message: str) -> str:
 
 
 def in_studio_words(answer: Any) -> Any:
-    """Return an answer of JSON values with its sentences as the studio says them."""
+    """Return an answer of JSON values with its sentences in the words of the studio."""
     if isinstance(answer, list):
         return [in_studio_words(x) for x in answer]
     if not isinstance(answer, dict):

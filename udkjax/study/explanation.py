@@ -277,7 +277,7 @@ def _shown(count: int, most: int = MOST_ROWS, first: int = FIRST_ROWS) -> int:
 
 
 def _first(lines: list[str], left_out: str = "") -> list[str]:
-    """Return lines to print: all, or the first ones and what is left out."""
+    """Return the first lines, and a line that counts the others or says `left_out`; all lines if they are few."""
     shown = _shown(len(lines))
     rest = left_out or (f"and {len(lines) - shown} more" if shown < len(lines) else "")
     return [*lines[:shown], *([rest] if rest else [])]

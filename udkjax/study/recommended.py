@@ -25,7 +25,7 @@ def needed_tolerances() -> tuple[NeededTolerances, ...]:
 
 
 def tolerance_lines(name: str) -> list[str]:
-    """Return, for each error, the range of tolerances that all mechanisms needed, and those that mechanisms of this name needed."""
+    """Return, for each error, the range of tolerances that all mechanisms needed, and the tolerances for those of this name."""
     table = needed_tolerances()
     errors = list(dict.fromkeys(error for one in table for error in one.tolerances))
     lines = []

@@ -19,7 +19,7 @@ MOST = 0.1
 
 
 class Deviation(NamedTuple):
-    """The largest deviation of a design from its goal, beside the extent of the goal.
+    """The largest deviation of a design from its goal, and the extent of the goal.
 
     Attributes:
         largest: the largest distance of a target from the motion, or difference of an output (m, rad).

@@ -83,7 +83,7 @@ class DirectedMechanism(NamedTuple):
     joints: tuple[tuple[str, int], ...]  # the names of the joints, and the indices of their friction among the forces
 
     def with_sides(self, sides: Float[Array, "F 2"]) -> Mechanism:
-        """Return the mechanism in which the directed friction of joint j has the mode sides[j]: direction of sliding, and rest."""
+        """Return the mechanism in which the directed friction of joint j has the mode sides[j]: direction, and rest."""
         if not self.joints:
             return self.mechanism
         return eqx.tree_at(lambda m: [m._forces[k].sides for _, k in self.joints], self.mechanism, list(sides))

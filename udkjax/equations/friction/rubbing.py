@@ -259,8 +259,8 @@ class _Growth(NamedTuple):
     """State of a continuation in the share of friction: solution x, share reached, next increment, and whether it continues."""
 
     x: Array
-    reached: Array  # the share
-    stage: Array  # by which it grows next
+    reached: Array  # the share of friction for which x is the solution
+    stage: Array  # the next increment of the share
     goes_on: Array
 
 

@@ -57,7 +57,7 @@ class AbstractSystem(eqx.Module):
 
     @property
     def textbook(self) -> Any:
-        """The equations of the mechanism or user-defined system itself, without what wraps them."""
+        """The equations of the mechanism or user-defined system itself, not of equations that wrap them."""
         return self
 
     @property
@@ -67,7 +67,7 @@ class AbstractSystem(eqx.Module):
 
     @property
     def programs_of_rows(self) -> RunPrograms | None:
-        """The programs that find independent rows, among all of them."""
+        """The programs that find independent rows among all rows."""
         return None
 
     def size(self, dq: Vector) -> Float[Array, ""]:

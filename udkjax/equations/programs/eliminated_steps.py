@@ -58,7 +58,7 @@ class Eliminated:
         return AlongTangent(found["dq1"], square, stiffness, damping, found["dv"], -found["multipliers"])
 
     def _prepared(self) -> SceneArrays[np.ndarray] | None:
-        """Return the programs; None until they are worth it."""
+        """Return the programs; None until preparing them pays off."""
         if self._arrays is None:
             if len(self._uses) < WORTH:
                 self._uses.append(0)

@@ -99,7 +99,7 @@ class SceneArrays(Generic[AnyArray]):
         return self._run_at_state(LINEARIZATION, t, q, self._xp.zeros_like(q), {"dq": direction}, often=True)
 
     def accelerations(self, t: Time, q: AnyArray, v: AnyArray) -> "Accelerations | None":
-        """Return accelerations at many states by elimination; None if a program by machine code is not worth it yet."""
+        """Return accelerations at many states by elimination; None until compiling them to machine code pays off."""
         found: Any = self._run_at_many(ACCELERATIONS, {"t": np.asarray(t, float).reshape(1, -1), "q": q, "v": v})
         entries: Any = found and self._entries(found)
         return found and Accelerations(found["a"], found["multipliers"], found["distance"][0], entries)
@@ -129,7 +129,7 @@ class SceneArrays(Generic[AnyArray]):
         return evaluate(blank | state | given)
 
     def _run_at_many(self, outputs: tuple[str, ...], state: Mapping[str, Any]) -> dict[str, AnyArray] | None:
-        """Run a program at many states by machine code; None if that is not worth it yet, or impossible."""
+        """Run a program at many states by machine code; None until compiling it pays off, or if it is impossible."""
         evaluate, sizes, _ = self._evaluator(outputs)
         compiled: Any = evaluate.at_many(sizes, {name: len(x) for name, x in state.items()})
         return None if compiled is None else compiled(np.asarray(self._constants), state)
@@ -137,7 +137,7 @@ class SceneArrays(Generic[AnyArray]):
     def _run_at_state(
         self, outputs: tuple[str, ...], t: Any, q: AnyArray, v: AnyArray, given: Mapping[str, AnyArray], often: bool = False
     ) -> dict[str, AnyArray] | None:
-        """Run a program at one state by machine code, if that is worth it, or on Python's floats, and return its results alone.
+        """Run a program at one state by machine code if compiling it pays off, else on Python's floats; return only its results.
 
         None if neither is possible.
         """

@@ -46,7 +46,7 @@ class DigitsRule(NamedTuple):
     arc: float = 1e-4  # over which c is a difference, in units of the scene's scales
 
     def hold(self, sigma: Any, rate: Any) -> Any:
-        """Return whether they are correct, with arrays or values of machine code."""
+        """Return True if ten digits of q'' are correct at a distance `sigma` with the rate c; arrays or values of a module."""
         return (sigma > self.least) & (rate * rate * self.clear**3 < sigma * sigma * sigma)
 
 

@@ -44,10 +44,10 @@ class SceneChanges(eqx.Module):
     holds: Bool[Array | np.ndarray, "T C"]
     places: Float[Array | np.ndarray, "T A n"]  # coordinates at which each added joint was added last
     numbers: tuple[Array, ...]  # of the added joints, the contacts, and the friction of contacts
-    form: "_Form | None" = eqx.field(static=True)  # their structure; None: they are unknown
-    names: tuple[str, ...] = eqx.field(static=True)  # the constraints in the mechanism with all of them
+    form: "_Form | None" = eqx.field(static=True)  # the structure of added joints, contacts and their friction; None: unknown
+    names: tuple[str, ...] = eqx.field(static=True)  # the names of the constraints in the mechanism with all of them
     public: tuple[str, ...] = eqx.field(static=True)  # the names by which results list them
-    of_scene: int = eqx.field(static=True)  # number of those of the scene
+    of_scene: int = eqx.field(static=True)  # number of the constraints that belong to the scene
     sticking: tuple[str, ...] = eqx.field(static=True, default=())  # the names of contacts with friction in `Solution.sticking`
 
     @property
@@ -205,7 +205,7 @@ class KnownState(eqx.Module):
 
 
 class Knowledge(NamedTuple):
-    """Known changes of the constraints along a motion, at its times T: joints that stick, and joints that events add or remove."""
+    """Changes of the constraints known along a motion, at its times T: by joints that stick, and by events."""
 
     sticking: Bool[Array, "T F"] | None
     changes: SceneChanges | None

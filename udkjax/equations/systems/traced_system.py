@@ -30,7 +30,13 @@ from udkjax.programs.identity_cache import cached_by_identity, is_concrete
 from udkjax.requirements import ArgumentError
 from udkjax.scene.model import RunModel
 
-FUNCTIONS = {"mass": "q", "force": "tqv", "constraint": "tq", "velocity_constraint": "tqv", "potential": "tq"}  # and arguments
+FUNCTIONS = {
+    "mass": "q",
+    "force": "tqv",
+    "constraint": "tq",
+    "velocity_constraint": "tqv",
+    "potential": "tq",
+}  # by name, with the names of the arguments
 MOST_NUMBERS = 20_000  # more, as of a table, would be copied to the memory of every lane
 
 

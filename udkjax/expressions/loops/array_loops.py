@@ -38,8 +38,8 @@ class ArrayLoops:
     def __init__(self, program: LoopProgram, xp: ModuleType, results: Collection[str] | None = None):
         self._parts, self._xp, self._program, self._results = list(map(_lay_out, program.parts)), xp, program, results
         self._calls, self._runs_at_many = 0, 0
-        self.compiled: CompiledLoops | None = None  # the same at single states, by machine code
-        self._at_many: CompiledAtMany | None = None  # and at many
+        self.compiled: CompiledLoops | None = None  # machine code of the program at single states
+        self._at_many: CompiledAtMany | None = None  # machine code of the program at many states
         self._written = {name for part in self._parts for name, *_ in part.outputs}
         self._read = {name for part in self._parts for name, _ in part.inputs if name}
         self._on_floats = FloatLoops(self._parts) if xp is np and FloatLoops.support(self._parts) else None
@@ -73,7 +73,7 @@ class ArrayLoops:
         self.compiled = compiled_loops(self._program, sizes, tuple(self._results or ()))
 
     def at_many(self, sizes: Mapping[str, int], given: Mapping[str, int]) -> CompiledAtMany | None:
-        """Return the program at many states by machine code; None until it has run so often that it is worth compiling.
+        """Return the program at many states by machine code; None until it has run so often that compiling it pays off.
 
         Args:
             sizes: the lengths of all its arrays except `constants` and those that describe a state.

@@ -36,12 +36,12 @@ class Leaving(NamedTuple):
 
 
 class Pieces(NamedTuple):
-    """Expressions with held sides."""
+    """Smooth expressions: copies of others in which each comparison is held on one side (-1, 1; or an integer part)."""
 
     outputs: list[Scalar]
-    sides: list[Scalar]  # inputs
-    ways: list[Leaving]
-    renewed: list[Scalar]  # the sides at a state: those of unknown ones, and of those that depend on others
+    sides: list[Scalar]  # inputs of the copies, the held side of each comparison
+    ways: list[Leaving]  # conditions under which a comparison changes its side
+    renewed: list[Scalar]  # the sides at a state, for comparisons whose sides are unknown or depend on others
     has_opaque: bool  # whether a loop or a branch that is opaque, so that its kinks are unknown, depends on what moves
 
 
@@ -77,7 +77,9 @@ class _Held:
         self.ways: list[Leaving] = []
         self.is_nested: list[bool] = []
         self._known: dict[tuple[str, int], tuple[Scalar, int]] = {}  # the side of each g, and the sign with which it was added
-        self._remainders: dict[int, tuple[Scalar, Scalar]] = {}  # by the copy of each: its side, and y
+        self._remainders: dict[
+            int, tuple[Scalar, Scalar]
+        ] = {}  # by the index of the copy of x mod y: the integer part of x / y, and y
 
     def hold(self, outputs: Sequence[Scalar]) -> list[Scalar]:
         graph, copies = self.graph, {}
@@ -157,7 +159,7 @@ class _Held:
         return side and self._either(side, plain, where(_compare(lax.gt_p if name == "max" else lax.lt_p, side, 0.0), a, b))
 
     def _sign(self, a: Scalar, b: Scalar | None) -> Scalar | None:
-        """Return the side of a - b, or of a; None if it does not move."""
+        """Return the side of a - b, or of a; None if it depends on no input in the groups `moving`."""
         g = a if b is None else a - b
         if not g.node.depends & self.moving:
             return None
@@ -180,7 +182,7 @@ class _Held:
         return where(apply(lax.is_finite_p, bool, n), side if sign > 0 else -side, n)
 
     def _whole(self, u: Scalar) -> Scalar | None:
-        """Return the whole number below u; None if it does not move."""
+        """Return the largest integer that is at most u; None if u depends on no input in the groups `moving`."""
         if not u.node.depends & self.moving:
             return None
         key = f"whole {u.sign}", u.index
@@ -209,7 +211,7 @@ class _Held:
 
 
 class _Renewed(_Held):
-    """A copy of expressions with the sides that their state has."""
+    """A copy of expressions whose sides follow from the state."""
 
     def __init__(self, graph: Graph, moving: Collection[str]):
         super().__init__(graph, moving)
@@ -229,7 +231,7 @@ def _compare(primitive, a: Scalar, b: float) -> Scalar:
 
 
 def _towards_zero(n: Scalar) -> Scalar:
-    """Return the whole number next to zero of the two between which the side n holds."""
+    """Return the one of n and n + 1 that is nearer to zero, where n is the held integer part of a number."""
     return where(_compare(lax.lt_p, n, 0.0), n + 1.0, n)
 
 

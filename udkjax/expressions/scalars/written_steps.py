@@ -25,7 +25,7 @@ _WORTH_WRITING = 20
 
 
 def written_as(text: str, function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a function that is written as an expression of its arguments, {0}, {1} ..., where it would be called."""
+    """Give a function an expression of its arguments {0}, {1}, ..., which `PythonFunction.call` writes instead of a call."""
     function.text = text  # pyright: ignore[reportFunctionMemberAccess]
     return function
 

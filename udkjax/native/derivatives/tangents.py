@@ -132,7 +132,7 @@ class Forward(Differentiated):
         self._evaluate_solved(f, i)
         for ways in ([way for way in self.ways if way in GIVEN], self.ways[-1:]):
             with self._each_group(f):
-                for way in ways:  # without their own contribution
+                for way in ways:  # the tangent of the state must not contain the tangent of this stage
                     with self._in_way(f, way), f.each(self.registers("tangent")) as r:
                         self.put(f, name, r, f.select(mask, 0.0, self.vector(f, name, r, "tangent")), "tangent")
             with self._each_tangent(f):
@@ -281,7 +281,7 @@ class Forward(Differentiated):
                     f.store(f.load(changes, i), self._way(f, way), tangent_lane + self.place("constants", i, "tangent"))
 
     def _changes_of_numbers(self, f: Function, way: str, member: Value, direction: Value) -> Value:
-        """Return the address of the tangents of a member's numbers along a direction; sampled ones have those of the current row."""
+        """Return the address of a member's tangents along a direction; those of sampled numbers are of the current row."""
         count = self.code.number_count
         numbers = f.at(self.member_address(f, f"{way}numbers", member), direction * count)
         places = self.active_samples

@@ -132,7 +132,7 @@ class _Launch:
         return f.load(words, 1, base=INT).is_not(0)
 
     def _allocate(self, each: Value) -> tuple[Value, Value, Value]:
-        """Allocate the buffer of a chunk of members with records of `each` so many bytes.
+        """Allocate the buffer of a chunk of members, `each` bytes for the record of each member.
 
         Chunks are halved until there is memory for one; the handler returns XLA's error if there is none for a single member.
 

@@ -113,7 +113,7 @@ class FrictionPart(Part):
 
 
 class FallbackPart(Part):
-    """The steps that elimination cannot take; this one leaves all steps to the solver."""
+    """The steps that elimination cannot take; this base class leaves all steps to the solver."""
 
     finds_dependent_rows = False  # whether rows that depend on others show by their pivots
 
@@ -179,7 +179,7 @@ class FallbackPart(Part):
 
 
 class StiffnessPart(Part):
-    """The implicit steps of stiff motions; this one has none, and runs never leave the module."""
+    """The implicit steps of stiff motions; this base class has none, and its runs never leave the module."""
 
     method: Method | None = None
     """The implicit method."""

@@ -72,7 +72,9 @@ class Projected(ProjectionPart):
 
     def __init__(self, module: Module):
         self._in = module
-        self._drops_rows = module.m > 0 and not module.code.policy.reports  # without a check of their pivots
+        self._drops_rows = (
+            module.m > 0 and not module.code.policy.reports
+        )  # dependent rows are left out without a check of their pivots
         self.shared = ("velocities",) if self._drops_rows else ()
 
     @property

@@ -77,7 +77,7 @@ def time_to_singularity(s: Lane, accepted: bool = False) -> Value:
 
 
 def step_across(f: Function, method: Method, time_left: Value, h: Value) -> Value:
-    """Return a step like h that has a singular configuration ahead in the middle of a wide gap between its nodes."""
+    """Return a step of about length h, such that a singular configuration ahead is in the middle of a wide gap between nodes."""
     low, high = (float(x) for x in method.clearings)
     return time_left / f.select(time_left / h < low, f.const(low, DOUBLE, f.width), high)
 

@@ -9,7 +9,7 @@ from udkjax.native.pseudoinverses.dense import DenseMatrices, DenseMethod
 
 @dataclass(frozen=True)
 class OneOfCode(DenseMethod):
-    """Code of several dense methods, each with its own matrices and a copy of D and b; a method runs if any lane has chosen it."""
+    """Code of several dense methods, each with its own matrices and a copy of D and b; a method runs if a lane has chosen it."""
 
     methods: tuple[DenseMethod, ...]
 

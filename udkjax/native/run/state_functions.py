@@ -140,7 +140,7 @@ class StateProjection(StateFunction):
 class StateJump(StateProjection):
     """The projection of states that events change, and the largest row of Psi_dot that it leaves, over the row's scale.
 
-    Psi_dot is linear in the velocities: what is left is of rows that contradict others.
+    Psi_dot is linear in the velocities: the remaining violation is that of rows that contradict others.
     """
 
     @property

@@ -207,7 +207,7 @@ class ChosenSteps(ImplicitSteps):
         with f.if_(f.any_of(measured | implicit)):
             length = STABLE * self.gain  # length of a step that pays, times the largest rate
             s.where(accept & tries, stiff=1.0)
-            pays = s.growth >= (self._by.diagonal * length) ** 2  # at least: the growth is less where dampers are stiff
+            pays = s.growth >= (self._by.diagonal * length) ** 2  # a lower bound: stiff dampers make the growth smaller
             s.where(implicit, unpaid=f.select(pays | tries, f.const(0.0, DOUBLE, f.width), s.unpaid + 1.0))
             returns = implicit & (s.unpaid >= UNPAID)
             fails = returns | (tries & ~accept)

@@ -125,7 +125,7 @@ class PassingRuns(Trajectory):
         f.call(conditions, f.given["work"])
 
     def floor_of(self, f: Function, s: Lane, c: Value) -> Value:
-        """Return below which distance from zero a condition is zero: its scale is no less than its change in a unit of time."""
+        """Return the distance from zero below which a condition is zero; its scale is at least its change in a unit of time."""
         assert self.passing is not None
         rate, floor = (self.entry(f, f"condition {name}", c) for name in ("rate", "floor"))
         return f.max(f.abs(rate) * self.passing.zero / s.omega, floor)

@@ -18,7 +18,7 @@ from udkjax.scene.mechanism import Mechanism
 
 
 class InstantCentre(NamedTuple):
-    """The point (m) at which two links move alike; at infinity it is a direction, a unit vector."""
+    """The point (m) at which two links have the same velocity; at infinity, a direction (unit vector)."""
 
     place: Float[np.ndarray, "2"]
     at_infinity: bool

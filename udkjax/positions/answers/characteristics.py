@@ -1,4 +1,4 @@
-"""Characteristics of a mechanism as a course asks for them: type, mobility, strokes, dead points, transmission, ratios."""
+"""Characteristics of a mechanism as textbooks define them: type, mobility, strokes, dead points, transmission, ratios."""
 
 from typing import NamedTuple
 
@@ -130,7 +130,7 @@ def _numbered(title: str, k: int, count: int) -> str:
 
 @checked
 def characteristics(mechanism: Mechanism, driver: Drive = None) -> Characteristics:
-    """Return the characteristics that a course asks for: type, mobility, strokes, dead points, transmission, ratios.
+    """Return the characteristics of a mechanism: type, mobility, strokes, dead points, transmission, ratios.
 
     Extremes over the driver's range are located to rounding, from exact derivatives of the positions. The transmission angle is
     that between two links, folded to at most 90 degrees.

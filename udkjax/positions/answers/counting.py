@@ -1,4 +1,4 @@
-"""Values of a driver as a course counts them: the angle of a crank as drawn, from the x axis, in the units of the drawing."""
+"""Values of a driver as textbooks count them: the angle of a crank as drawn, from the x axis, in the units of the drawing."""
 
 import math
 from contextlib import suppress
@@ -126,7 +126,7 @@ class Count(NamedTuple):
 
 
 def link_line(drawing: Drawing, link: str) -> tuple[str, str, float]:
-    """Return the two pins whose line has the angle of a link in a course, and its difference from the body's angle (rad).
+    """Return the two pins whose line gives a link its angle in textbooks, and its difference from the body's angle (rad).
 
     The line begins at a pin on the ground if the link has one. A link of one pin has its body's angle.
     """

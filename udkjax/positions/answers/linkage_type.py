@@ -38,7 +38,7 @@ class FourBarType(NamedTuple):
 
     @property
     def words(self) -> str:
-        """The condition and the type, as a course says them."""
+        """Grashof's condition and the type of the four-bar, as a phrase."""
         sign = "=" if self.kind == "change point" else "<" if self.grashof < 0 else ">"
         return f"{self.kind} ({'-'.join(self.pins)}: shortest + longest {sign} sum of the others)"
 

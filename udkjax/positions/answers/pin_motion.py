@@ -1,4 +1,4 @@
-"""Positions, velocities and accelerations of all pins and links of a mechanism, as the tables of a course."""
+"""Positions, velocities and accelerations of all pins and links of a mechanism, as tables."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -207,7 +207,7 @@ def motion_at(
     acceleration: Annotated[NumberLike | str, FINITE_OR_TEXT] = 0.0,
     held: Annotated[Mapping[str, NumberLike], NUMBERS_BY_NAME] | None = None,
 ) -> PinMotion:
-    """Return the motion of all pins and links where a course asks for it: `udk.motion_at(mech, "60 deg", rate="600 rpm")`.
+    """Return the motion of all pins and links at values of the driver: `udk.motion_at(mech, "60 deg", rate="600 rpm")`.
 
     Angles are those of the drawing: the angle of a crank is that of the line from its pin on the ground to its other pin,
     from the x axis.

@@ -66,7 +66,7 @@ def pressure_angles(mechanism: Mechanism, q: Float[np.ndarray, "T bodies 3"], ca
     own = [name == cam for name, _ in rows.names]
     D = np.stack([rows.dense(rows.at(0.0, x.ravel())[2]) for x in q])
     held = _slopes(mechanism, driver, q) * rows.metric
-    ways = _ways(np.concatenate([D[:, ~np.array(own)], held], 1)) * rows.metric
+    ways = _null_vectors(np.concatenate([D[:, ~np.array(own)], held], 1)) * rows.metric
     if np.isnan(ways).all():
         problem = f"{quote(cam)}: without it and with its driver held, the follower has not one way to move"
         raise SceneError([problem], mechanism.name)
@@ -94,7 +94,7 @@ def _slope(mechanism: Mechanism, driver: str | Coordinate, q: Float[Array, "bodi
     return jax.grad(value_of(mechanism, driver))(q)
 
 
-def _ways(rows: Float[np.ndarray, "T rows n"]) -> Float[np.ndarray, "T n"]:
+def _null_vectors(rows: Float[np.ndarray, "T rows n"]) -> Float[np.ndarray, "T n"]:
     """Return the null vector of each of T Jacobians whose null space has dimension one; NaN for the others."""
     values, vectors = np.linalg.svd(rows)[1:]
     free = rows.shape[2] - np.sum(values > RANK * values[:, :1], axis=1)

@@ -30,7 +30,7 @@ CHORDS = 2  # with the Jacobian there: each makes one more order of the derivati
 
 
 class DrivenPoses(NamedTuple):
-    """PosesAndRates of a driven mechanism, as functions of z = (q, s) in the units of a curve."""
+    """Poses and rates of a driven mechanism, as functions of z = (q, s) in the units of a curve."""
 
     curve: Curve
 
@@ -42,7 +42,7 @@ class DrivenPoses(NamedTuple):
 
 
 class RunPoses(NamedTuple):
-    """PosesAndRates on the cubic between two output times of a run, as functions of z = (t,), from 0 to 1."""
+    """Poses and rates on the cubic between two output times of a run, as functions of z = (t,), from 0 to 1."""
 
     ts: Float[Array, "2"]
     states: Float[Array, "2 2 bodies 3"]  # positions and velocities at both

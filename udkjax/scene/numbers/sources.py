@@ -248,7 +248,7 @@ _NUMBERS = (jax.Array, np.ndarray, np.generic, float)
 
 
 def is_number(leaf: object) -> bool:
-    """Return True if a leaf is a number, and not what a function on trees has put in its place."""
+    """Return True if a leaf is a number, not an object that a function on trees has put in its place."""
     return isinstance(leaf, _NUMBERS)
 
 

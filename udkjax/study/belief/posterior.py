@@ -179,7 +179,7 @@ class Posterior:
         return tuple({name: np.stack([table[name] for table in tables]) for name in tables[0]} for tables in records)
 
     def _thinned(self, draws: int) -> "Posterior":
-        """Return about so many of the draws, equally from all chains."""
+        """Return about `draws` draws, equally many from each chain."""
         every = max(1, -(-self.x.shape[0] * self.x.shape[1] // draws))
         fields = {name: getattr(self, name)[:, ::every] for name in ("x", *PER_DRAW)}
         return replace(self, **fields, steps=self.steps[::every])

@@ -118,7 +118,7 @@ class FixSearch:
                 yield found
 
     def _verify(self, name: str, removes: int, change: JointChange) -> "tuple[Fix, FixSearch] | None":
-        """Return a fix and the search after it, or None if the effect on the mechanism is another than on its Jacobian."""
+        """Return a fix and the search after it; None if the change affects the mechanism differently than its Jacobian."""
         changed = apply_change(self.mechanism, name, change)
         if changed is None:
             return None

@@ -19,9 +19,9 @@ HALVINGS = 20  # of the interval of the common factor
 
 
 class Limits(NamedTuple):
-    """Limits of the measures that have any."""
+    """Limits of L of the measures."""
 
-    which: np.ndarray  # their indices
+    which: np.ndarray  # (L,): indices of these measures
     low: np.ndarray
     high: np.ndarray
 

@@ -389,7 +389,7 @@ def _cramer(matrix: list[list[EquationLine]], right: list[EquationLine], unknown
 
 
 def _put_in(matrix: list[list[EquationLine]], right: list[EquationLine], unknowns: list[NamedQuantity]) -> list[EquationLine]:
-    """Return the solution of more equations, and each of them with it put in."""
+    """Return the lines of the solution of linear equations, and each equation with this solution in it."""
     rows = [
         total(*((1.0, ProductOfTerms((_left(a), x))) for a, x in zip(row, unknowns, strict=True) if a.right != NO_TERMS))
         for row in matrix

@@ -174,7 +174,7 @@ def wrapped(angle: float) -> float:
 
 
 def _tidy(angle: float) -> float:
-    """Return an angle, with one that rounding separates from zero as zero."""
+    """Return an angle; zero if only rounding separates it from zero."""
     return 0.0 if abs(angle) < NOTHING else angle
 
 

@@ -49,7 +49,7 @@ class Topology(NamedTuple):
 
 
 class DyadPositions(NamedTuple):
-    """DyadPositions of K linkages at T angles of the crank.
+    """Positions of K linkages at T angles of the crank.
 
     Attributes:
         origins: origins of all links (L, K, T).

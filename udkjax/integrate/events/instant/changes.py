@@ -55,10 +55,10 @@ def scene_changes(
 class _ChangingScene(NamedTuple):
     """The part of `SceneChanges` that is the same for all runs."""
 
-    switches: tuple[int, ...]  # without locks of joints that stick
+    switches: tuple[int, ...]  # indices of the switches, without those of joints that stick
     adding: tuple[int, ...]  # the events of the joints that events add
-    guess: Float[Any, "1 n"]  # of the scene
-    fields: dict[str, Any]  # of `SceneChanges`
+    guess: Float[Any, "1 n"]  # initial guess of the scene
+    fields: dict[str, Any]  # the other fields of `SceneChanges`
 
 
 def _changing_scene(phases: Phases, *events: Event) -> _ChangingScene:

@@ -24,7 +24,7 @@ class Kinks(NamedTuple):
 
 
 class Listing(NamedTuple):
-    """A run with the events that are listed, and what else its events tell."""
+    """A run with its listed events, its kinks, and the joints that stick."""
 
     run: EventRun  # `event_index` is an index of the names of events
     kinks: Kinks | None  # None without any

@@ -74,7 +74,9 @@ def _settle(system: System, runs: MemberRuns, members: MemberIndices) -> MemberR
         is_zero, now = size <= ZERO * values.scale, side_of_zero(values, take(system.rate, members), xp)
         # Contacts are approached from the allowed side: an impact whose condition is zero at the start and falls happens at once.
         before = xp.where(begins[:, None], xp.where(falling & is_zero, 1, now), sides[:, :E])
-        now = xp.where(plan.slides & ~begins[:, None] & ~is_zero, before, now)  # its reversal was too slow to be one
+        now = xp.where(
+            plan.slides & ~begins[:, None] & ~is_zero, before, now
+        )  # a reversal at a speed that counts as zero is none
         watched = watched & ~((event == AGAIN)[:, None] & _settled(system, runs, members))
         crossing = first_crossing(plan.both_directions[:E], watched, before, now, xp)
         # A condition that an impact turns back at zero has reached zero before: its event comes first.

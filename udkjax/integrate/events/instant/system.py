@@ -64,7 +64,7 @@ class System(Protocol):
     def project(
         self, members: MemberIndices, at: RunState, is_free: bool = False
     ) -> tuple[Float[Any, "b n"], Float[Any, "b n"], Float[Any, "b"]]:
-        """Return the states projected to the constraints of their phases, and the largest row of Psi_dot left, over its scale."""
+        """Return q and v projected to the constraints of their phases, and the largest remaining row of Psi_dot per scale."""
         ...
 
     def add_joints(self, members: MemberIndices, new: Bool[Any, "b A"], q: Float[Any, "b n"], joints: Any) -> Any:
@@ -76,15 +76,15 @@ class System(Protocol):
         ...
 
     def sides(self, members: MemberIndices, joints: Any) -> Float[Any, "b S"]:
-        """Return the sides of comparisons (kinks.py), the last of the joints."""
+        """Return the sides of the comparisons in forces (kinks.py): the last entry of `joints`."""
         ...
 
     def with_sides(self, members: MemberIndices, joints: Any, sides: Float[Any, "b S"]) -> Any:
-        """Return the joints that events have added, with other sides of members."""
+        """Return `joints` with other sides of the comparisons in forces of members."""
         ...
 
     def turned(self, members: MemberIndices, k: Int[Any, "b"], at: RunState) -> Float[Any, "b S"]:
-        """Return the sides of members after event k at their states."""
+        """Return the sides of the comparisons in forces of members after event k at their states."""
         ...
 
     def when(self, mask: Bool[Any, "B"], change: Change, runs: MemberRuns) -> MemberRuns:

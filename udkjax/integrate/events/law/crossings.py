@@ -32,7 +32,7 @@ class ConditionValues(NamedTuple):
 
 
 def zero_of(slides: Bool[np.ndarray, "E"], atol: Float[Any, "*b 1"], xp: ModuleType = jnp) -> Float[Any, "*b E"]:
-    """Return below what conditions are zero along a motion, relative to their scales; `slides` marks the speeds of joints."""
+    """Return the bounds, relative to their scales, below which conditions count as zero; `slides` marks the speeds of joints."""
     return xp.where(slides, xp.maximum(SLOW * atol, ZERO), ZERO)
 
 

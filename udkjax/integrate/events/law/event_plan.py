@@ -154,12 +154,12 @@ class EventPlan:
 
     @cached_property
     def directions_of_sliding(self) -> Int[np.ndarray, "F"]:
-        """The side of each joint that is its direction of sliding; the next one tells whether it is at rest."""
+        """Index of the side that is the direction of sliding of each joint; the next side tells whether the joint is at rest."""
         return np.array([x.first for x in self.sticking], int)
 
     @cached_property
     def contacts_that_rub(self) -> Int[np.ndarray, "F"]:
-        """The event of the contact of each joint that may stick; -1: it is no contact."""
+        """Index of the event of the contact in which each joint rubs; -1: the joint is not in a contact."""
         return np.array([x.contact for x in self.sticking], int)
 
     @cached_property

@@ -87,7 +87,7 @@ class HeldElement(NamedTuple):
 
     force: int | None  # index of the element among the forces of a mechanism; None for the loads of a system
     smooth: SmoothLoads
-    coordinates: tuple[int, ...]  # on which they may depend
+    coordinates: tuple[int, ...]  # indices of the coordinates on which the loads may depend
     first: int  # index of its first side
     event: int  # index of the first of its events, counted from the first kink
 

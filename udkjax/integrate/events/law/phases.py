@@ -35,7 +35,7 @@ SCENE, SWITCHED = 0, 1  # the mechanisms of a run
 
 
 class Switches(NamedTuple):
-    """The switches, C, what the events, E, do to them, and the rows of Psi with all switches, m; hashable."""
+    """The C switches, their changes at the E events, and the m rows of Psi with all switches; hashable."""
 
     names: tuple[str, ...] = ()  # their constraints in the mechanism with all switches
     first: tuple[bool, ...] = ()  # the phase in which a run begins: constraints of the scene are on, all others are off

@@ -49,7 +49,7 @@ class Detection(NamedTuple):
 
     sides: Int[Any, "G C"]  # sides of zero at the nodes
     place: Int[Any, ""]  # the last node before the first crossing where the crossing condition is not zero
-    behind: Int[Any, ""]  # the first node after the crossing
+    next_node: Int[Any, ""]  # the first node after the crossing
     is_found: Bool[Any, ""]
     event: Int[Any, ""]
     root: Float[Any, ""]  # place of the crossing between these nodes, from 0 to 1
@@ -126,7 +126,7 @@ def detect(
     return Detection(
         sides=sides,
         place=last_before,
-        behind=place + 1,
+        next_node=place + 1,
         is_found=is_found & ~is_coarse,
         event=event,
         root=root[event],

@@ -109,7 +109,7 @@ class MachineSystem:
         return StateValues(*self._by_phase(members, at, PhaseCode.at))
 
     def project(self, members: MemberIndices, at: RunState, is_free: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the states projected to the constraints of their phases, and the rates that are left."""
+        """Return q and v projected to the constraints of their phases, and the largest remaining row of Psi_dot per scale."""
         q, v, left = self._by_phase(members, at, PhaseCode.project)
         return q, v, left
 
@@ -147,12 +147,12 @@ class MachineSystem:
         return take(joints[-1], members)
 
     def with_sides(self, members: MemberIndices, joints: Any, sides: Float[np.ndarray, "b S"]) -> Any:
-        """Return the joints that events have added, with other sides of members; changed in place."""
+        """Return `joints` with other sides of the comparisons in forces of members; changed in place."""
         joints[-1][self._all if members is None else members] = sides
         return joints
 
     def turned(self, members: MemberIndices, k: Int[np.ndarray, "b"], at: RunState) -> Float[np.ndarray, "b S"]:
-        """Return the sides of members after event k at their states."""
+        """Return the sides of the comparisons in forces of members after event k at their states."""
         factor, shift = self.plan.side_changes
         return self._renew(members, at, self.sides(members, at.joints) * factor[k] + shift[k])
 

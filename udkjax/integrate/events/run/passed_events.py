@@ -1,4 +1,4 @@
-"""Events that machine code passes by itself (native/watching/passing.py): which they are, and the records of them."""
+"""Events that machine code passes by itself (native/watching/passing.py): their selection, and their records."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple

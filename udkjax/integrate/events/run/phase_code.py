@@ -275,7 +275,7 @@ class PhaseCode:
         return self._values
 
     def project(self, members: Int[np.ndarray, "b"], state: RunState) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return positions and velocities of members, projected to the constraints of their phases, and what rates are left."""
+        """Return q and v of members, projected to the constraints of their phases, and the largest remaining row of Psi_dot."""
         t, q, v, *_ = state
         n = q.shape[1]
         further = _of(self._of_states, members), _of(self._rows, members), np.zeros((1, 0))

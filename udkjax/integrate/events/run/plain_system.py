@@ -63,7 +63,7 @@ class PlainSystem:
         return jax.tree.map(lambda x: x[None], self.hybrid.values(without_member(at), is_free, is_directed, has_forces))
 
     def project(self, members: MemberIndices, at: RunState, is_free: bool = False) -> tuple[Array, Array, Array]:
-        """Return positions and velocities that the phase of a state allows, and the rates that are left."""
+        """Return q and v projected to the constraints of the phase, and the largest remaining row of Psi_dot over its scale."""
         hybrid = self.hybrid
         # A replay without joints that move bodies as they are attached corrects nothing: one step has all derivatives.
         steps = 1 if hybrid.replays and hybrid.plan.has_only_contacts else 2

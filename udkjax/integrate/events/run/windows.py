@@ -163,7 +163,7 @@ def advance_window(motion: WindowMotion, window: Window, state: RunState, given:
         unresolved=xp.isfinite(window.unresolved) | zooms,  # an interval that is being refined was fine enough
         xp=xp,
     )
-    place, width = hit.place, nodes[hit.behind] - nodes[hit.place]
+    place, width = hit.place, nodes[hit.next_node] - nodes[hit.place]
     root = nodes[place] + hit.root * width
     is_shortest = length <= xp.maximum(RESOLUTION.finest / units.rate, 100 * len(times) * smallest)
     undefined = hit.is_coarse & is_shortest & hit.undefined[:E]
@@ -184,7 +184,7 @@ def advance_window(motion: WindowMotion, window: Window, state: RunState, given:
     node = xp.where(stays, xp.where(hit.is_coarse, hit.last_sure, place), xp.where(returns, 0, len(nodes) - 1))
     last_good = xp.where(xp.all(good), len(times) - 1, xp.maximum(xp.sum(good) - 1, 0))
     # Where a condition jumps, the event happens at the first time after the jump.
-    k = xp.where(stays | returns, at[xp.where(is_located, hit.behind, node)], last_good)
+    k = xp.where(stays | returns, at[xp.where(is_located, hit.next_node, node)], last_good)
     t_new = times[k]
     rows = xp.where((output < T) & (requested < t_new), output, T)
     of_outputs = xp.searchsorted(times, xp.clip(requested, t, end))
@@ -211,7 +211,7 @@ def advance_window(motion: WindowMotion, window: Window, state: RunState, given:
                 hit.is_found & ~is_located, hit.event, xp.where((end < window.high) | returns, window.event, NO_EVENT)
             ),
             high=xp.where(
-                hit.is_found, xp.where(hit.is_exact, root, nodes[hit.behind]), window.high + xp.where(returns, change, 0.0)
+                hit.is_found, xp.where(hit.is_exact, root, nodes[hit.next_node]), window.high + xp.where(returns, change, 0.0)
             ),
             lands=xp.where(hit.is_found, hit.is_exact, window.lands),
             last=xp.where(is_located, t_new, window.last),

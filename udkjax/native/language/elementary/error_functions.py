@@ -38,7 +38,7 @@ def _complement(f: Function, x: Value) -> Value:
     low = rounded((upper - x) * (upper + x))
     e = reduce(f, -rounded(upper * upper), low)
     t = (x - 3.0) / (x + 3.0)
-    # sums and the quotient are in two parts, the second of which is the rounding error
+    # sums and the quotient are sums of two doubles, the second of which is the rounding error
     part = rounded(t * polynomial(t, ERFC[1:]))
     top, bottom, fraction = part + ERFC[0], x + x + 1.0, e.high + 1.0
     ratio, ratio_error = quotient(f, (top, part - (top - ERFC[0])), (bottom, x + x - (bottom - 1.0)))

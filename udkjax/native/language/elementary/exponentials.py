@@ -1,7 +1,7 @@
 """Exponential and hyperbolic functions.
 
-x = n log 2 + r, and e^r = 1 + r + r^2 / 2 + r^3 q(r), where q interpolates at Chebyshev nodes. n log 2 is subtracted in two
-parts, of which the first is exact for all exponents n, with and without fused multiply-add (the method of fdlibm).
+x = n log 2 + r, and e^r = 1 + r + r^2 / 2 + r^3 q(r), where q interpolates at Chebyshev nodes. n log 2 is subtracted as two
+doubles, of which the first is exact for all exponents n, with and without fused multiply-add (the method of fdlibm).
 """
 
 import math

@@ -1,7 +1,7 @@
 """Inverse trigonometric functions.
 
 atan a = atan b + atan((a - b) / (1 + a b)) for the nearest b of 0, 1/2, 1; asin x = pi / 2 - 2 asin(sqrt((1 - x) / 2)) above
-1/2 (the methods of fdlibm). The polynomials interpolate at Chebyshev nodes; constants are in two parts.
+1/2 (the methods of fdlibm). The polynomials interpolate at Chebyshev nodes; constants are sums of two doubles.
 """
 
 from udkjax.native.language.elementary.parts import INFINITY, bits, copy_sign, polynomial, rounded, upper_half
@@ -76,7 +76,7 @@ def atan2(f: Function, y: Value, x: Value) -> Value:
 
 
 class _Arcsine:
-    """The common parts of arcsine and arccosine: s = sqrt((1 - |x|) / 2) in two parts for |x| >= 1/2, and (asin s - s) / s."""
+    """The common parts of arcsine and arccosine for |x| >= 1/2: s = sqrt((1 - |x|) / 2), two doubles, and (asin s - s) / s."""
 
     def __init__(self, f: Function, x: Value):
         size = f.abs(x)

@@ -1,7 +1,7 @@
 """Powers with any exponent, and cube roots.
 
-|x|^y = 2^(y log2 |x|), with log2 |x| in two parts, of which the first has 26 digits: its products with the upper half of y are
-exact, with and without fused multiply-add (the method of fdlibm).
+|x|^y = 2^(y log2 |x|), with log2 |x| as a sum of two doubles, of which the first has 26 digits: its products with the upper half
+of y are exact, with and without fused multiply-add (the method of fdlibm).
 """
 
 from udkjax.native.language.elementary.exponentials import LOG2, scale, series
@@ -25,7 +25,7 @@ from udkjax.native.language.ir import Function, Value
 
 # log((1 + s) / (1 - s)) = 2 s + 2 s^3 (1 + s^2 L(s^2)) / 3 up to sqrt(3 / 2); error of L 2^-52
 LOG = (0.5999999999999999, 0.42857142857213787, 0.33333333252377917, 0.27272761039607346, 0.23070564718152986, 0.2055021192151487)
-# Constants in two parts, of which the first has 26 digits
+# Constants as sums of two doubles, of which the first has 26 digits
 CP, CP_PARTS = 0.9617966939259756, (0.9617966860532761, 7.872699542894897e-09)  # 2 / (3 log 2)
 LOG2_OF_THREE_HALVES = (0.5849624872207642, 1.350039202129749e-08)
 LOG2_PARTS = (0.6931471675634384, 1.2996506893889889e-08)

@@ -1,8 +1,8 @@
 """The tangent.
 
-x = n pi / 2 + r with |r| <= pi / 4 in two parts; tan r = r + r^3 / 3 + r^5 P(r^2) up to 0.67, and beyond from pi / 4 - |r| (the
-method of fdlibm); -1 / tan r for odd n. P interpolates at Chebyshev nodes. The remainder of a huge number needs those digits of
-2 / pi that its exponent selects (Payne and Hanek); integers compute it.
+x = n pi / 2 + r with |r| <= pi / 4 as a sum of two doubles; tan r = r + r^3 / 3 + r^5 P(r^2) up to 0.67, and beyond from
+pi / 4 - |r| (the method of fdlibm); -1 / tan r for odd n. P interpolates at Chebyshev nodes. The remainder of a huge number needs
+those digits of 2 / pi that its exponent selects (Payne and Hanek); integers compute it.
 """
 
 import math
@@ -87,7 +87,7 @@ def _tan_of_remainder(f: Function, remainder: _Remainder) -> Value:
     unit = f.select(odd, -1.0, 1.0)
     quotient = f.select(large, rounded(w * w), -1.0) / f.select(large, w + unit, w)
     of_large = flip_sign(unit - rounded((x - (quotient - r)) * 2.0), sign)
-    # -1 / (x + r), with w in two parts
+    # -1 / (x + r), with w as a sum of two doubles
     upper, w_upper = upper_half(quotient), upper_half(w)
     error = f.fma(upper, r - (w_upper - x), f.fma(upper, w_upper, 1.0))
     return f.select(large, of_large, f.select(odd, f.fma(quotient, error, upper), w))
