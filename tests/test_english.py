@@ -66,6 +66,7 @@ BEGINNINGS = [
     (r"Whether\b", "Whether it is finite.", "True if it is finite."),
     (r"How\b", "How many there are.", "Number of bodies."),
     (r"Do nothing\.?$", "Do nothing.", "Do nothing: an evaluation sets `rank`."),
+    (r"Write `\w+(\([\w, ]*\))?`\.$", "Write `settle_end`.", "Write `settle_end`: settle the loads at the end."),
     (r"Return those of\b", "Return those of chunk k.", "Return the random numbers of chunk k."),
     (r"(?:[A-Z][a-z]+){2,} (of|on|between)\b", "PosesAndRates of a body.", "Poses of a body."),
 ]
@@ -95,6 +96,7 @@ PHRASES = [
     (r"\bnone to (see|be)\b", "no cause, if there is none to see", "there is none"),
     (r"\bwritten out\b", "small matrices, written out", "The loops are unrolled."),
     (r"\bis said by\b", "A wrong threshold is said by its result.", "It is said to be exact."),
+    (r"^Return .*, or None\.$", "Return the pin in a hole, or None.", "Return the pin; None if there is none."),
     (r"\bbase of both\b", "The base of both modes.", "Base of forward and reverse mode."),
     (r"(?<!are )\bin two parts\b", "the logarithm in two parts", "a sum of two doubles; they are two parts of one force"),
     (

@@ -267,7 +267,7 @@ class _Expanded:
         return results if self._primitive.multiple_results else results[0]
 
     def trace(self) -> Any:
-        """Return the program of the operations into which this one is expanded, or None."""
+        """Return the program of the operations into which this one is expanded; None if JAX has to evaluate it."""
         function = self._function()
         return None if function is None else jax.make_jaxpr(function)(*self._inputs)
 

@@ -160,10 +160,10 @@ def largest_effort(mechanism: Mechanism, reactions: Reactions, sign: float) -> F
     constant = limits(scene, fixed._replace(multipliers=0 * fixed.multipliers), origin)  # of joints without load
 
     def again(c: Array, search: _TangentSearch) -> _TangentSearch:
-        """Move to the solution of the linear program with tangents at z; those of unloaded joints turn to the other side."""
-        z, touches = search.z, jnp.where(search.count == 0, search.z + aside, search.z)
-        slope = jax.jacfwd(lambda z: limits(scene, fixed, z))(touches)
-        available = limits(scene, fixed, touches) + slope @ (z - touches)
+        """Move z to the solution of the linear program linearized there; unloaded joints change the sign of their slope."""
+        z, base = search.z, jnp.where(search.count == 0, search.z + aside, search.z)
+        slope = jax.jacfwd(lambda z: limits(scene, fixed, z))(base)
+        available = limits(scene, fixed, base) + slope @ (z - base)
         is_unloaded = (available - constant <= LOADED * fixed.scale) & (search.count > 0)
         slope = jnp.where(is_unloaded[:, None], -search.slope, slope)
         rows = jnp.concatenate([sides - slope, -sides - slope])

@@ -22,7 +22,7 @@ SHAPE = ("density", "thickness", "width", "outline", "mass", "inertia", "centre"
 
 
 def drawn_fix(text: str, mechanism: Mechanism, fix: Fix) -> JsonObject:
-    """Return a fix of the mechanism of a drawing: what changes in words, and the changed `document`, or None.
+    """Return a fix of the mechanism of a drawing: its description, and the changed `document`, None if it cannot be drawn.
 
     A document is returned only if it can be read, and has the bodies, forces, drivers and joints of the fix.
     """

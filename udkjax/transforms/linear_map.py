@@ -53,7 +53,7 @@ class DifferentiableFunction(eqx.Module):
         """Return the shapes of f(x)."""
 
     def forward(self, inputs: list[Array], active: Mask, tangents: list[Array], run: Any) -> list[Array]:
-        """Return J v. `run` is the record that the evaluation of f at x stored for first derivatives, or None."""
+        """Return J v. `run` is the record that the evaluation of f at x stored for first derivatives; None: it stored none."""
         del run
         return change_along(self, inputs, active, tangents)[1]
 

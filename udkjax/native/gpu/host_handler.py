@@ -258,7 +258,7 @@ def _run(f: Function, frame: Value, on_host: Value, stream: Value) -> tuple[Vari
 
 
 def _thread_count() -> Function:
-    """Write XLA_FFI_ThreadPool_NumThreads."""
+    """Write XLA_FFI_ThreadPool_NumThreads: return the number of threads that the word `THREADS` holds."""
     f = Function("thread_count", [(POINTER, "given")], returns="ptr", cold=True)
     f.store(WORDS.load(f, THREADS, INT), word(f, f.given["given"], GIVEN, POINTER), base=INT)
     f.line("ret ptr null")

@@ -68,7 +68,7 @@ def friction_of(module: Memory, names: Sequence[str]) -> FrictionPart:
 
 
 def write_settle_state(module: Memory, f: Function, s: Lane):
-    """Write `settle_state`."""
+    """Write `settle_state`: find the loads of joints at `state`, by rounds of Newton's method, else by shares of friction."""
     s.friction_share = f.const(1.0, DOUBLE, f.width)
     _write_rounds(module, f, s, SETTLING_ROUNDS, _may_settle)
     with f.if_(f.any_of(s.unsettled > 0.5)):
@@ -126,7 +126,7 @@ def _write_rounds(module: Memory, f: Function, s: Lane, most: int, goes_on: Call
 
 
 def write_settle_end(module: Memory, f: Function):
-    """Write `settle_end`."""
+    """Write `settle_end`: settle the loads of joints at the end of a step, with its velocities `result v`."""
     module.copy(f, "state v", "saved v")
     module.copy(f, "result v", "state v")
     f.call("settle_state", f.given["work"], f.given["out"])

@@ -143,7 +143,7 @@ class RankRevealing(FallbackPart):
     # --- loads of joints with friction
 
     def with_loads(self, f: Function, do: Callable[[], None], lanes: Value | None = None):
-        """Run `do` with the loads that friction has where the fallback takes a step; `lanes`: where only some pivots are unsafe.
+        """Run `do` with the loads of friction in steps of the fallback: pivots must be safe, in the given `lanes` or in all.
 
         Towards a singular configuration the loads of joints may grow without bounds, and friction by them may jam the mechanism
         in a range that a step crosses. Rows without a safe pivot carry none of these loads, in runs and in their derivatives.

@@ -51,7 +51,7 @@ class OwnFormulationCode(FormulationCode):
         return a
 
     def written(self, m: int, n: int, width: int = 1, stride: int | None = None) -> Written:
-        """Return the function, with the length of the rows of A in memory; by default that of a single member."""
+        """Return the function; rows of A are `stride` numbers apart, by default those of a single member."""
         stride = -(-n // processor.lanes()) * processor.lanes() if stride is None else stride
         shapes = {"mass": (n,), "force": (n,), "D": (m, n), "b": (m,), "numbers": (sum(self.own.sizes),)}
         inputs = [Input(name, shape, stride if name == "D" else None) for name, shape in shapes.items()]

@@ -117,7 +117,7 @@ class ByPartition(ProjectionPart):
         s.violated = largest_violation(module, f)
 
     def _write_choice(self):
-        """Write `choose_partition(work)`."""
+        """Write `choose_partition(work)`: mark the dependent coordinates and velocities, by pivots at the state."""
         module, rows = self._in, self._rows
         f, _ = module.function("choose_partition")
 
@@ -135,7 +135,7 @@ class ByPartition(ProjectionPart):
         choose("v")
 
     def _write_closure(self):
-        """Write `close_state(work)`."""
+        """Write `close_state(work)`: solve Psi and Psi_dot for the dependent coordinates and velocities."""
         module, steps = self._in, PARTITION_NEWTON.most_steps
         f, s = module.function("close_state")
         closing = s.closing > 0.5

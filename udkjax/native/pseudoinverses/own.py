@@ -44,7 +44,7 @@ class OwnCode(DenseMethod):
         return plus, rank
 
     def written(self, m: int, n: int, width: int = 1, stride: int | None = None) -> Written:
-        """Return the function of D, whose rows have a length in memory, and the tolerance; by default that of a single member."""
+        """Return the function of D and the rank tolerance; rows of D are `stride` apart, by default as for a single member."""
         stride = -(-n // processor.lanes()) * processor.lanes() if stride is None else stride
         return written(self, (Input("D", (m, n), stride), Input("tol", (1,))), width)
 

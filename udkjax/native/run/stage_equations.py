@@ -74,7 +74,7 @@ class StageEquations:
         """Reserve the memory of a subclass; nothing by default."""
 
     def write(self):
-        """Write all functions."""
+        """Write all functions of the stage equations."""
         self._slopes.evaluation()
         self._slopes.forward()
         self._write_factor("factor_stage", self._layout, "kept")

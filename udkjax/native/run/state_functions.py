@@ -258,7 +258,7 @@ class ScaleCode(Memory):
         return ThreadCode([f, *programs], kernels, loops.globals, self.places.size)
 
     def _write_loops(self) -> LoopWriter:
-        """Write `find_scales(numbers, work, scales)`."""
+        """Write `find_scales(numbers, work, scales)`: compute the characteristic scales of a member from its numbers."""
         loops = LoopWriter(1, cold=True)
         at = {name: ("work", place) for name, place in self.places.places.items()}
         at |= {"numbers": ("numbers", 0), "scales": ("scales", 0)}

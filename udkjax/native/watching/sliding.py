@@ -340,7 +340,7 @@ class _Choice(_Modes):
         return found.value
 
     def _find_locks(self, mask: Value):
-        """Give the locks of the joints of the masked lanes their places."""
+        """Set the numbers of locks that depend on q, for the joint of the event, in the masked lanes."""
         f, module, place = self._f, self._module, 2 * self._slides.count
         module.copy(f, "sure q", "state q")
         for j, lock in enumerate(self._slides.locks):

@@ -82,7 +82,7 @@ def explain_open(
 
 
 def _close_without_drivers(mechanism: Mechanism, guess: np.ndarray) -> np.ndarray | None:
-    """Return a closed position of the joints alone, or None."""
+    """Return a position that closes the joints without the drivers; None if none is found."""
     rows = kinematic_rows(Mechanism(dict(mechanism.bodies), dict(mechanism.joints), gravity=mechanism.gravity))
     if not rows.count:
         return guess

@@ -48,7 +48,7 @@ class ForceElement(PrintsLine):
         return None
 
     def loads(self, t: Number, *frames: Frame) -> Sequence[Wrench] | None:
-        """Return (force x, force y, torque about the centre of mass) for each attached body, in ground axes (N, N m), or None."""
+        """Return (force x, force y, torque about the centre of mass) for each body, in ground axes (N, N m); None: no loads."""
         return None
 
     @property

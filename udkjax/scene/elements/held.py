@@ -119,7 +119,7 @@ def rows_of(x: Sampled, xp: ModuleType) -> Any:
 
 
 def with_row(x: Sampled, row: Any) -> Any:
-    """Return the `Held` or spline of a single interval, from its row of numbers; the row may also be a mark, or None."""
+    """Return the `Held` or spline of a single interval, from its row of numbers; the row may also be None or a mark."""
     if isinstance(x, Spline):
         return make_module(SplinePiece, row=row)
     return make_module(Held, values=row.reshape(1, *x.values.shape[1:]) if hasattr(row, "reshape") else row, dt=1.0, t0=0.0)

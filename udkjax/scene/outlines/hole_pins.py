@@ -54,7 +54,7 @@ class HolePins:
         return [pin for pin in found if pin is not None]
 
     def _at(self, hole: RoundHole, problems: list[str]) -> str | None:
-        """Return the pin in a hole, or None."""
+        """Return the pin in a hole; None if the hole has no pin."""
         for name, place in self._places.items():
             off = float(np.hypot(*(place - hole.centre)))
             if off < hole.radius:

@@ -211,7 +211,7 @@ class RankedPositions:
         return rows
 
     def near(self, t: float, q: np.ndarray) -> Configuration | None:
-        """Return the closed position nearest to q, or None.
+        """Return the closed position nearest to q; None if none is found.
 
         The rows that are left out hold where the others do, unless branches meet: there all rows are closed together.
         """
@@ -225,7 +225,7 @@ class RankedPositions:
         return None
 
     def displace(self, start: Configuration, direction: np.ndarray, step: float, t: float | None = None) -> Configuration | None:
-        """Displace `start` by a step along a direction in scaled coordinates; return the nearest closed position, or None."""
+        """Displace `start` by a step along a direction in scaled coordinates; return the nearest closed position, if any."""
         return self.near(start.t if t is None else t, start.q + step * self.unit * direction)
 
     def distance(self, first: Configuration, second: Configuration, turns: bool = True) -> float:
