@@ -95,7 +95,7 @@ class Peer(NamedTuple):
     starts: tuple[float, ...] = STARTS
 
     def available(self) -> str | None:
-        """Return the installed version, or None."""
+        """Return the installed version; None without the package."""
         try:
             return version(self.package)
         except PackageNotFoundError:

@@ -316,7 +316,7 @@ def _number(given: Any, unit: str, units: Units) -> float:
 
 
 def _share(holds: np.ndarray) -> tuple[float, float]:
-    """Return the share of samples that hold and its standard error, which is positive even if all samples hold, or none."""
+    """Return the share of samples that hold and its standard error, which is positive even if all hold, or none does."""
     count = len(holds)
     smoothed = (holds.sum() + 1.0) / (count + 2.0)
     return float(holds.mean()), float(np.sqrt(smoothed * (1.0 - smoothed) / count))
