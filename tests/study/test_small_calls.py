@@ -78,9 +78,9 @@ def test_calls_of_kinematics_and_inverse_dynamics():
     motion = udk.kinematics(crank, None, TIMES)
     four_bar = udk.library.four_bar()
     assert calls_of(lambda: udk.kinematics(crank, None, TIMES)) < 620
-    assert calls_of(lambda: udk.kinematics(four_bar, "body.crank.angle", ANGLES)) < 810
-    assert calls_of(lambda: udk.inverse_dynamics(crank, TIMES, motion)) < 620
-    assert calls_of(lambda: udk.inverse_dynamics(crank, TIMES)) < 1_130
+    assert calls_of(lambda: udk.kinematics(four_bar, "body.crank.angle", ANGLES)) < 950  # 779 in a process of its own
+    assert calls_of(lambda: udk.inverse_dynamics(crank, TIMES, motion)) < 640
+    assert calls_of(lambda: udk.inverse_dynamics(crank, TIMES)) < 1_280
     assert calls_of(lambda: udk.reactions(crank, motion)) < 1_030
 
 

@@ -100,7 +100,7 @@ class SceneArrays(Generic[AnyArray]):
 
     def accelerations(self, t: Time, q: AnyArray, v: AnyArray) -> "Accelerations | None":
         """Return accelerations at many states by elimination; None until compiling them to machine code pays off."""
-        found: Any = self._run_at_many(ACCELERATIONS, {"t": np.asarray(t, float).reshape(1, -1), "q": q, "v": v})
+        found: Any = self._run_at_many(self._evaluator(ACCELERATIONS), {"t": np.asarray(t, float).reshape(1, -1), "q": q, "v": v})
         entries: Any = found and self._entries(found)
         return found and Accelerations(found["a"], found["multipliers"], found["distance"][0], entries)
 
@@ -118,20 +118,19 @@ class SceneArrays(Generic[AnyArray]):
         many = q.shape[1:]
         if not many and xp is np and (found := self._run_at_state(outputs, t, q, v, given)) is not None:
             return found
+        evaluate, sizes, _ = evaluator = self._evaluator(outputs)
         if many and xp is np:
             state = {"t": np.asarray(t, float).reshape(1, -1), "q": q, "v": v, **given}
-            if (found := self._run_at_many(outputs, state)) is not None:
+            if (found := self._run_at_many(evaluator, state)) is not None:
                 return found
-        evaluate, sizes, _ = self._evaluator(outputs)
         blank = {x: xp.zeros((size, *many)) for x, size in sizes.items()}
         constants = self._constants[:, None] if many else self._constants
         state = {"constants": constants, "t": xp.reshape(xp.asarray(t, float), (1, *many)), "q": q, "v": v}
         return evaluate(blank | state | given)
 
-    def _run_at_many(self, outputs: tuple[str, ...], state: Mapping[str, Any]) -> dict[str, AnyArray] | None:
+    def _run_at_many(self, evaluator: "_Evaluator", state: Mapping[str, Any]) -> dict[str, AnyArray] | None:
         """Run a program at many states by machine code; None until compiling it pays off, or if it is impossible."""
-        evaluate, sizes, _ = self._evaluator(outputs)
-        compiled: Any = evaluate.at_many(sizes, {name: len(x) for name, x in state.items()})
+        compiled: Any = evaluator.loops.at_many(evaluator.blank, {name: len(x) for name, x in state.items()})
         return None if compiled is None else compiled(np.asarray(self._constants), state)
 
     def _run_at_state(

@@ -88,7 +88,7 @@ def reactions(
     scene, method = scene_along(mechanism, solution), SVD() if method is None else method
     stabilization = scene.gains(stabilization)
     soft = None if compliances is None else compliance_rows(scene.mechanism, compliances)
-    given = times_of(solution), solution.q, solution.v, scene.analysis, stabilization
+    given = scene.ts, solution.q, solution.v, scene.analysis, stabilization
     if soft is None and scene.knowledge.is_constant and by_numpy(scene.mechanism, given, method):
         loads = _loads_by_numpy(*scene[:2], history_of(solution), method, stabilization, frame=frame, about=about)
     else:
@@ -119,7 +119,7 @@ def unique_reactions(
         For each joint and driver, and each of its bodies, booleans (T, 3) for force x, force y and torque.
     """
     scene = scene_along(mechanism, solution)
-    given = times_of(solution), solution.q, scene.analysis, rank_tol
+    given = scene.ts, solution.q, scene.analysis, rank_tol
     if scene.knowledge.is_constant and by_numpy(scene.mechanism, given):
         marks = _uniqueness_by_numpy(*scene[:2], history_of(solution)[:2], rank_tol, frame, about)
     else:

@@ -62,6 +62,7 @@ class Animation:
         data: data of the player, as JSON.
         failures: causes of failed runs by label.
         mechanisms: the mechanism of each run, whose points and links pictures name.
+        gaps: the gaps between links of each run; None for a run without them.
     """
 
     def __init__(
@@ -72,7 +73,7 @@ class Animation:
         gaps: Sequence[LeastGaps | None] = (),
     ):
         self.data, self.failures, self.mechanisms = data, dict(failures or {}), mechanisms
-        self._gaps = [*gaps] or [None] * len(data["runs"])
+        self.gaps = [*gaps] or [None] * len(data["runs"])
         self._motions = [motion_of(record) for record in data["runs"]]
         self._arrows = [arrows_of(record) for record in data["runs"]]
         self._paths: list[list[TracedPath]] | None = None
@@ -150,7 +151,7 @@ class Animation:
 
     def touching(self, t: float | None = None) -> list[list[JsonObject]]:
         """Return the outlines {body, points, radius} of the links of each run that touch at time t (s), if gaps are shown."""
-        shown = zip(self.data["runs"], self._gaps, self.pose(t), strict=True)
+        shown = zip(self.data["runs"], self.gaps, self.pose(t), strict=True)
         return [
             []
             if found is None
