@@ -81,7 +81,7 @@ def test_calls_of_kinematics_and_inverse_dynamics():
     assert calls_of(lambda: udk.kinematics(four_bar, "body.crank.angle", ANGLES)) < 950  # 779 in a process of its own
     assert calls_of(lambda: udk.inverse_dynamics(crank, TIMES, motion)) < 640
     assert calls_of(lambda: udk.inverse_dynamics(crank, TIMES)) < 1_280
-    assert calls_of(lambda: udk.reactions(crank, motion)) < 1_030
+    assert calls_of(lambda: udk.reactions(crank, motion)) < 1_150
 
 
 def test_calls_of_a_position_of_rest():
