@@ -132,20 +132,28 @@ class LeastGaps(PrintsTable):
 
     def touching(self, frames: Mapping[str, Float[np.ndarray, "3"]]) -> list[int]:
         """Return the indices of the `parts` of links that touch, by the frames x, y, angle (m, m, rad) of links; others rest."""
-        places, of = (
-            [],
-            {name: [k for k, part in enumerate(self.parts) if part.body == name] for pair in self.pairs for name in pair.pair},
-        )
-        for part in self.parts:
-            x, y, angle = frames.get(part.body, np.zeros(3))
-            turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
-            places.append((np.asarray(part.corners, float) @ turn + [x, y])[..., None])
+        places = [corners[..., None] for corners in self.corners_in(frames)]
 
         def touch(i: int, j: int) -> bool:
             return signed_distance(places[i], places[j])[0] <= float(self.parts[i].radius) + float(self.parts[j].radius)
 
-        pairs = [(of[one], of[other]) for one, other in (gap.pair for gap in self.pairs)]
+        pairs = self.parts_of_pairs
         return sorted({k for one, other in pairs if any(touch(i, j) for i in one for j in other) for k in (*one, *other)})
+
+    def corners_in(self, frames: Mapping[str, Any]) -> list[Float[np.ndarray, "corners 2"]]:
+        """Return the corners (m) of each of the `parts`, moved from their own frames to x, y, angle of links; others stay."""
+        moved = []
+        for part in self.parts:
+            x, y, angle = map(float, frames.get(part.body, (0.0, 0.0, 0.0)))
+            turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+            moved.append(np.asarray(part.corners, float) @ turn + [x, y])
+        return moved
+
+    @property
+    def parts_of_pairs(self) -> list[tuple[list[int], list[int]]]:
+        """The indices of the `parts` of both links of each pair."""
+        of = {name: [k for k, part in enumerate(self.parts) if part.body == name] for gap in self.pairs for name in gap.pair}
+        return [(of[one], of[other]) for one, other in (gap.pair for gap in self.pairs)]
 
     def _length(self, length: Any, scale: float) -> str:
         size, unit = (1.0, "m") if self.count is None else (self.count.units.size("m"), self.count.units.shown("m"))

@@ -53,11 +53,9 @@ def outlines(found: LeastGaps, bodies: Sequence[str], frames: Mapping[str, np.nd
         bodies: names of the bodies by number; any other name is the ground, -1.
         frames: x, y, angle (m, m, rad) of the frame of each body in which its points are given; by default its own frame.
     """
-    parts, number = [], {name: k for k, name in enumerate(bodies)}
-    for part in found.parts:
-        x, y, angle = (0.0, 0.0, 0.0) if frames is None or part.body not in frames else map(float, frames[part.body])
-        turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
-        points = (np.asarray(part.corners, float) @ turn + [x, y]).tolist()
-        parts.append({"body": number.get(part.body, -1), "points": points, "radius": float(part.radius)})
-    of = {name: [k for k, part in enumerate(found.parts) if part.body == name] for pair in found.pairs for name in pair.pair}
-    return {"parts": parts, "pairs": [[of[one], of[other]] for one, other in (gap.pair for gap in found.pairs)]}
+    number = {name: k for k, name in enumerate(bodies)}
+    parts = [
+        {"body": number.get(part.body, -1), "points": corners.tolist(), "radius": float(part.radius)}
+        for part, corners in zip(found.parts, found.corners_in(frames or {}), strict=True)
+    ]
+    return {"parts": parts, "pairs": [[*pair] for pair in found.parts_of_pairs]}
