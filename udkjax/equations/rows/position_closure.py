@@ -59,6 +59,9 @@ class ClosingRule(NamedTuple):
 
     tol: float = 1e-9  # largest Psi, in units of the scene's scales, at which a position counts as closed
     rounding: float = 32.0  # times eps and the largest coordinate: smaller residuals are rounding errors
+    # Correction, or residual, in units of the scene's scales, after which a Newton step far from dependent rows is the last: what
+    # remains is of the order of its square.
+    last: float = 1e-9
     longest_step: float = 0.3  # largest change of a coordinate in one step, in rad or characteristic lengths: keeps the branch
     steps: int = 40  # maximum number of Gauss-Newton steps; five or six are usual: convergence is quadratic
     pace_steps: int = 4  # steps over which the rate of convergence is measured: see `try_to_close`

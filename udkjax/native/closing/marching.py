@@ -28,8 +28,6 @@ from udkjax.native.pseudoinverses.weighted_rows import WeightedRows
 from udkjax.native.run.members import write_begin
 
 CORRECTIONS = 2
-# A correction up to this length, in characteristic lengths or radians, is the last: the next is of the order of its square.
-LAST_CORRECTION = 1e-9
 # Arc of a step, over the square of the distance from dependent rows, up to which all rows stay independent. Over an arc, a row
 # turns by about as much, and the span of the others by up to the arc over their distance.
 KEEPS_SIDE = 0.25
@@ -169,7 +167,7 @@ class Marching(Module):
             for name in ("state q", "prediction"):
                 self.put_entry(f, name, i, predicted)
         length, steps = f.variable(np.inf), f.variable(0, INT, 1)
-        is_long = lambda: ~(length.value < LAST_CORRECTION)  # noqa: E731
+        is_long = lambda: ~(length.value < CLOSURE.last)  # noqa: E731
         with f.while_(lambda: (steps.value < CORRECTIONS) & f.any_of(is_long())):
             self.invoke(f, "newton_q")
             corrects, longest = is_long(), f.variable(0.0)

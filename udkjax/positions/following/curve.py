@@ -26,8 +26,6 @@ from udkjax.programs.identity_cache import cached_by_identity
 from udkjax.scene.mechanism import Mechanism
 
 _ROUNDING = CLOSURE.rounding * float(np.finfo(float).eps)
-# Violation up to which a step by elimination, far from dependent rows, is the last: it leaves one of the order of the square.
-ALMOST_CLOSED = 1e-9
 NEWTON_STEPS = 8  # largest number; three are usual
 _Correction = tuple[Any, Any, Any]  # X, corrections so far, whether it is closed
 
@@ -272,7 +270,7 @@ class NumpyCurve(AbstractCurve):
             if not found:
                 return None
             q, psi = found
-            if np.abs(psi / self.rows).max() <= ALMOST_CLOSED:
+            if np.abs(psi / self.rows).max() <= CLOSURE.last:
                 return np.concatenate([q, x[-1:]]) / self.units
         return None
 
