@@ -18,6 +18,8 @@ from typing import Annotated, Any, Union, get_args, get_origin
 
 from mathml import typeset
 
+from udkjax import cli
+
 DIRECTIVE = re.compile(r"^::: (udkjax[\w.]*)\n(?: {4}(options: .*)\n)?", re.M)
 ARRAY = re.compile(r"(?:jaxtyping\.)?(?:Float|Int|Bool)\[[\w.]*(?:Array|ArrayLike|ndarray|Union\[.*?\]), *(['\"])(.*?)\1\]")
 MODULE = re.compile(r"\b(?:udkjax|collections|typing|jax|numpy|pathlib|diffrax|optimistix|scipy)(?:\.\w+)*\.(?=\w)")
@@ -30,7 +32,7 @@ ITEM = re.compile(r"^ {4}(\w+(?:, \w+)*): (.*(?:\n {5,}.*)*)", re.M)
 
 def command(name: str) -> str:
     """Return the section of a command in Markdown: description and options."""
-    function = getattr(importlib.import_module(f"udkjax.cli.{name}"), name)
+    function = cli.command(name)
     said, text = sections(function), inspect.getdoc(function) or ""
     lines = [
         f"## udkjax {name}\n",

@@ -74,7 +74,6 @@ CIRCLES = (
     "synthesis synthesis/complete",
 )
 MOST_MODULES = 16  # of a room, as many as one can keep in mind with what each is for
-LARGER = {"cli": 26}  # one module for each command
 
 
 def test_rooms_have_an_order(house):
@@ -89,8 +88,7 @@ def test_rooms_are_small():
         for folder in root.rglob("*")
         if folder.is_dir()
     }
-    assert {name: n for name, n in count.items() if n > LARGER.get(name, MOST_MODULES)} == {}
-    assert LARGER.keys() <= count.keys()
+    assert {name: n for name, n in count.items() if n > MOST_MODULES} == {}
 
 
 def test_rooms_say_what_lives_there():

@@ -18,7 +18,7 @@ from pathlib import Path
 import pytest
 
 import udkjax
-from udkjax.cli import COMMANDS
+from udkjax.cli import COMMANDS, command
 from udkjax.cli import main as udkjax_cli
 from udkjax.scene.tables.schema import CLASSES_BY_TYPE, keys
 
@@ -376,7 +376,7 @@ def wrong(words: list[str]) -> str:
         named = [word for word in rest if word in COMMANDS]
         if not named:
             return "" if not rest or rest[0] in ("COMMAND", "--version", "--help") else f"no command {rest[0]}"
-        function = getattr(importlib.import_module(f"udkjax.cli.{named[0]}"), named[0])
+        function = command(named[0])
         known = {f"--{name.strip('_').replace('_', '-')}" for name in inspect.signature(function).parameters}
         known |= {f"--no-{option[2:]}" for option in known} | {"--help"}
         return " ".join(option for option in options if option not in known)

@@ -102,7 +102,7 @@ def test_each_slow_test_is_in_one_part_and_what_is_named_exists(slow):
         assert all(f"def {name.rpartition('::')[2]}(" in text for name in own if name) and "pytest.mark.slow" in text
     assert slow.part_of("tests/native/language/test_ir.py") == "native"
     assert slow.part_of("tests/native/wasm/test_engine.py") == "webassembly"
-    assert slow.part_of("tests/test_cli.py") == "rest"
+    assert slow.part_of("tests/cli/test_commands.py") == "rest"
 
 
 def test_the_lowest_versions_are_those_of_the_project(slow):

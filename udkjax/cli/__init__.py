@@ -1,4 +1,4 @@
-"""The command line: `udkjax COMMAND`, each command a function in the module of the same name.
+"""The command line: `udkjax COMMAND`, each command a function in the module of the same name, in the folder of its subject.
 
 Only the standard library and tyro are imported before a command runs, so that help is fast.
 """
@@ -6,36 +6,37 @@ Only the standard library and tyro are imported before a command runs, so that h
 import gc
 import os
 import sys
+from collections.abc import Callable
 from importlib import import_module
 from importlib.metadata import version
 
 from udkjax.cli.exits import exit_codes
 from udkjax.extras import STUDIO, require
 
-COMMANDS = (
-    "report",
-    "simulate",
-    "animate",
-    "studio",
-    "sweep",
-    "identify",
-    "design",
-    "kinematics",
-    "gaps",
-    "solve",
-    "exercise",
-    "inverse",
-    "reactions",
-    "tolerances",
-    "statics",
-    "modes",
-    "export",
-    "check",
-    "convert",
-    "diagnose",
-    "explain",
-    "doctor",
-)
+COMMANDS = {  # in the order of the help, each with its folder
+    "report": "studies",
+    "simulate": "motion",
+    "animate": "motion",
+    "studio": "files",
+    "sweep": "studies",
+    "identify": "studies",
+    "design": "studies",
+    "kinematics": "motion",
+    "gaps": "motion",
+    "solve": "worked",
+    "exercise": "worked",
+    "inverse": "loads",
+    "reactions": "loads",
+    "tolerances": "studies",
+    "statics": "loads",
+    "modes": "loads",
+    "export": "files",
+    "check": "checks",
+    "convert": "files",
+    "diagnose": "checks",
+    "explain": "worked",
+    "doctor": "checks",
+}
 
 # New objects between garbage collections: most objects live to the end of a command, and scanning them takes 0.1 s.
 GARBAGE_EVERY = 50_000
@@ -54,8 +55,12 @@ def main(arguments: list[str] | None = None) -> None:
         require("tyro", *(STUDIO if words[:1] == ["studio"] else ()))
         from udkjax.cli.common import parse_and_run
 
-        commands = {name: getattr(import_module(f"udkjax.cli.{name}"), name) for name in COMMANDS}
-        parse_and_run(commands, arguments)
+        parse_and_run({name: command(name) for name in COMMANDS}, arguments)
+
+
+def command(name: str) -> Callable:
+    """Return the function of a command."""
+    return getattr(import_module(f"udkjax.cli.{COMMANDS[name]}.{name}"), name)
 
 
 def store_compiled_programs() -> None:

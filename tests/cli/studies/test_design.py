@@ -9,7 +9,7 @@ import pytest
 import udkjax as udk
 from tests.command_line import udkjax
 
-GOALS = Path(__file__).parents[1] / "examples" / "goals"
+GOALS = Path(__file__).parents[3] / "examples" / "goals"
 GOAL = """
 mechanism = "four_bar.toml"
 units = {length = "mm", angle = "deg"}

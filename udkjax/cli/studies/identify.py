@@ -88,7 +88,7 @@ def identify(
     mech, text = load(scene)
 
     import udkjax as udk
-    from udkjax.cli.identify_options import IdentifyOptions
+    from udkjax.cli.studies.identify_options import IdentifyOptions
 
     settings = {"loss": loss, "n_starts": n_starts, "tol": tol, "seed": seed}
     options = IdentifyOptions(mech, parameters, {"guess": guess, "bounds": bounds, "prior": prior})

@@ -16,7 +16,7 @@ from udkjax.cli.datasets import save
 from udkjax.cli.exits import exit_codes
 from udkjax.positions.assembling.assembly import AssemblyWarning
 
-EXAMPLES = Path(__file__).parents[1] / "examples"
+EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
 def results(capsys, *arguments):

@@ -14,10 +14,10 @@ import xarray
 
 import udkjax as udk
 from tests.command_line import udkjax
-from udkjax.cli.identify import Estimated, Loss
-from udkjax.cli.identify import identify as command
+from udkjax.cli.studies.identify import Estimated, Loss
+from udkjax.cli.studies.identify import identify as command
 
-EXAMPLES = Path(__file__).parents[1] / "examples"
+EXAMPLES = Path(__file__).parents[3] / "examples"
 PENDULUM = EXAMPLES / "compound_pendulum.toml"
 TRUTH, NOISE = 0.5, 0.3  # inertia of the rod, kg m2; of the measurements, degrees
 MASS, INERTIA, CHANNEL = "body.rod.mass", "body.rod.inertia", "body.rod.angle"

@@ -21,7 +21,7 @@ from udkjax.integrate import Result
 from udkjax.study.report import plain
 from udkjax.study.sweep.executors import ClusterError
 
-EXAMPLES = Path(__file__).parents[1] / "examples"
+EXAMPLES = Path(__file__).parents[2] / "examples"
 PARALLELOGRAM = EXAMPLES / "parallelogram.toml"
 
 
@@ -104,7 +104,7 @@ def test_choices_reach_the_simulation(tmp_path, choice):
 def test_the_choices_of_the_command_line_are_those_of_files():
     from udkjax.study.choices import CHOICES, choice
 
-    simulate = import_module("udkjax.cli.simulate")
+    simulate = import_module("udkjax.cli.motion.simulate")
     for setting, table in CHOICES.items():
         assert list(table) == list(get_args(getattr(simulate, setting.capitalize())))
         for name in table:

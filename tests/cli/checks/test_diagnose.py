@@ -8,7 +8,7 @@ import pytest
 
 from tests.command_line import udkjax
 
-PARALLELOGRAM = Path(__file__).parents[1] / "examples" / "parallelogram.toml"
+PARALLELOGRAM = Path(__file__).parents[3] / "examples" / "parallelogram.toml"
 
 
 def test_diagnose_prints_what_depends_on_what(capsys):

@@ -10,7 +10,7 @@ import xarray
 import udkjax as udk
 from tests.command_line import udkjax
 
-EXAMPLES = Path(__file__).parents[1] / "examples"
+EXAMPLES = Path(__file__).parents[3] / "examples"
 PENDULUM = EXAMPLES / "compound_pendulum.toml"
 THE_EXAMPLE = ("sweep", EXAMPLES / "parallelogram.toml", EXAMPLES / "grids" / "parallelogram.toml")
 GRID = """

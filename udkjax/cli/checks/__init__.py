@@ -1,0 +1,1 @@
+"""Commands that check: a scene, its constraints along a run, the installation."""

@@ -1,0 +1,1 @@
+"""Commands about forces and rest: drives, reactions, equilibria, small oscillations."""
