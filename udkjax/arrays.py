@@ -24,6 +24,7 @@ ArrayLibrary: TypeAlias = ModuleType  # numpy or jax.numpy
 
 # Bound on computed numbers that are zero in theory, relative to the largest number of the same kind: 256 times the precision.
 ROUNDING = 256 * float(np.finfo(float).eps)
+FULL_TURN = 2.0 * np.pi  # rad
 Module = TypeVar("Module")
 
 

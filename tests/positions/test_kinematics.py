@@ -769,3 +769,15 @@ def test_dense_values_are_followed_as_few_are(ground):
     found = march_at_once(driven.mechanism, driven.analysis, driven.unit, 1.0, q, np.linspace(2.5, 3.6, 7))
     assert found.trusted < 7 or set(found.side.tolist()) == {1.0, -1.0}  # it changes where branches meet, in a long step
     assert (found.trusted == 7) == (ground == 2.0)
+
+
+def test_what_needs_the_only_driver_says_which_there_are():
+    mech = udk.library.double_pendulum()
+    with pytest.raises(udk.SceneError, match=r"driver: the scene has no driver; name a coordinate, such as body\.upper\.angle"):
+        udk.gaps(mech)
+    motors = {
+        name: udk.Driver(("ground", body), "angle", udk.Polynomial([0.0]))
+        for name, body in (("motor", "upper"), ("servo", "lower"))
+    }
+    with pytest.raises(udk.SceneError, match="driver: the scene has 2 drivers; name one of motor, servo"):
+        udk.gaps(udk.Mechanism(mech.bodies, mech.joints, motors))

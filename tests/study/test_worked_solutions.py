@@ -152,7 +152,7 @@ def closes(solution, loop: VectorLoop, found) -> list[complex]:
     """Return the vectors of a loop as complex numbers, with the unknowns of a branch."""
     vectors = []
     for x in loop.vectors:
-        angle = 0.0 if x.body == "ground" else found.get(f"θ_{x.body}", solution.geometry.angle(x.body))
+        angle = 0.0 if x.body == "ground" else found.get(f"θ_{x.body}", solution.geometry.angles[x.body])
         size = found.get(f"s_{solution.symbols.pins[x.slide]}", x.size) if x.slide else x.size
         vectors.append(x.sign * size * np.exp(1j * (angle + x.turn)))
     return vectors

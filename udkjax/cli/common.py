@@ -144,10 +144,12 @@ def measure_channels(mech: "Mechanism", motion: "StateHistory", channels: "Seque
 
 def choose_driver(mech: "Mechanism", given: str | None) -> str:
     """Return the given driver, or the scene's only one; exit with a message if it has several drivers or none."""
-    if given is None and len(mech.driver_names) > 1:
-        refuse(f"--driver: the scene has {len(mech.driver_names)} drivers; name one of {', '.join(mech.driver_names)}")
-    if given is None and not mech.driver_names:
-        from udkjax.positions.following.drive import suggested_coordinate
+    if given is not None:
+        return given
+    from udkjax.positions.following.drive import only_driver
+    from udkjax.scene.tables.checks import SceneError
 
-        refuse(f"--driver: the scene has no driver; name a coordinate, such as {suggested_coordinate(mech)}")
-    return next(iter(mech.drivers)) if given is None else given
+    try:
+        return only_driver(mech)
+    except SceneError as error:
+        refuse(f"--{error.problems[0]}")

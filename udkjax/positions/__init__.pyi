@@ -5,7 +5,6 @@ from udkjax.positions.answers.centres import instant_centres as instant_centres
 from udkjax.positions.answers.characteristics import Characteristics as Characteristics
 from udkjax.positions.answers.characteristics import characteristics as characteristics
 from udkjax.positions.answers.counting import Count as Count
-from udkjax.positions.answers.counting import link_line as link_line
 from udkjax.positions.answers.linkage_type import pins_with_bodies as pins_with_bodies
 from udkjax.positions.answers.linkage_type import transmission_pins as transmission_pins
 from udkjax.positions.answers.motion_ranges import MotionRanges as MotionRanges
@@ -34,7 +33,6 @@ from udkjax.positions.assembling.channel_values import measure as measure
 from udkjax.positions.assembling.channel_values import path as path
 from udkjax.positions.assembling.channels import LOADS as LOADS
 from udkjax.positions.assembling.channels import RATES as RATES
-from udkjax.positions.assembling.channels import UNITS as UNITS
 from udkjax.positions.assembling.channels import Channel as Channel
 from udkjax.positions.assembling.channels import Quantity as Quantity
 from udkjax.positions.assembling.channels import StateHistory as StateHistory
@@ -44,7 +42,6 @@ from udkjax.positions.assembling.channels import has_point as has_point
 from udkjax.positions.assembling.channels import locate as locate
 from udkjax.positions.assembling.coordinates import Coordinate as Coordinate
 from udkjax.positions.assembling.coordinates import element_of as element_of
-from udkjax.positions.assembling.coordinates import slopes_of as slopes_of
 from udkjax.positions.assembling.coordinates import value_of as value_of
 from udkjax.positions.assembling.open_rows import explain_open as explain_open
 from udkjax.positions.assembling.open_rows import name_not_finite as name_not_finite
@@ -61,21 +58,17 @@ from udkjax.positions.following.drive import Driven as Driven
 from udkjax.positions.following.drive import constant_speed as constant_speed
 from udkjax.positions.following.drive import drive as drive
 from udkjax.positions.following.drive import only_driver as only_driver
-from udkjax.positions.following.drive import suggested_coordinate as suggested_coordinate
-from udkjax.positions.following.drive import with_drivers as with_drivers
 from udkjax.positions.following.drive import with_halted_drivers as with_halted_drivers
 from udkjax.positions.following.drive import without_drivers as without_drivers
 from udkjax.positions.following.free_numbers import FreeNumbers as FreeNumbers
 from udkjax.positions.following.free_numbers import position_model as position_model
-from udkjax.positions.following.kinematics import FULL_TURN as FULL_TURN
 from udkjax.positions.following.kinematics import Kinematics as Kinematics
 from udkjax.positions.following.kinematics import kinematics as kinematics
 from udkjax.positions.following.kinematics import motion_in_time as motion_in_time
 from udkjax.positions.following.kinematics import travel as travel
 from udkjax.positions.following.position_batch import BatchPositions as BatchPositions
 from udkjax.positions.following.position_batch import PositionBatch as PositionBatch
-from udkjax.positions.following.position_batch import compile_programs as compile_programs
-from udkjax.positions.following.position_batch import position_code as position_code
+from udkjax.positions.following.position_batch import compile_positions as compile_positions
 from udkjax.positions.gaps.arithmetic import gap_in_position as gap_in_position
 from udkjax.positions.gaps.gaps import LeastGap as LeastGap
 from udkjax.positions.gaps.gaps import LeastGaps as LeastGaps

@@ -5,6 +5,7 @@ from typing import TypeAlias
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from udkjax.annotations import NumericArray
@@ -16,10 +17,10 @@ from udkjax.equations.rows.analysis import Analysis
 from udkjax.equations.states.effort_arrays import efforts_by_numpy
 from udkjax.equations.terms.scale_program import RANK_TOL
 from udkjax.pinv import SVD
-from udkjax.positions.assembling.coordinates import Coordinate, element_of, slopes_of, value_of
-from udkjax.positions.following.drive import with_drivers
+from udkjax.positions.assembling.coordinates import Coordinate, element_of, value_of
 from udkjax.programs.deferred import deferred
 from udkjax.programs.identity_cache import cached_by_identity
+from udkjax.scene.elements.bodies import GROUND
 from udkjax.scene.mechanism import Mechanism
 from udkjax.statics.load_scale import load_sizes
 
@@ -51,7 +52,7 @@ def driver_efforts(
     """
     found = None
     if joints.is_concrete and not is_traced(values):
-        found = efforts_by_numpy(joints, slopes_of(values, joints.body_names), analysis, weights, ts, motion)
+        found = efforts_by_numpy(joints, _slopes_of(values, joints.body_names), analysis, weights, ts, motion)
     return found or _by_jax(joints.without_origin, analysis, values, jnp.asarray(weights), ts, *map(jnp.asarray, motion))
 
 
@@ -110,6 +111,45 @@ def _free_part(J: Float[Array, "m n"]) -> Callable[[Array], Array]:
     return lambda x: x - plus @ (J @ x)
 
 
+def _slopes_of(elements: Sequence[Coordinate], body_names: Sequence[str]) -> Callable[[np.ndarray], np.ndarray]:
+    """Return the derivatives C (k, n, T) of coordinates by q, as a function of q (n, T), by NumPy.
+
+    With p the vectors from the origins of the bodies to their points, n the direction of the coordinate, and d from point 1 to
+    point 2, it changes by n . (dx2 + p2' dtheta2 - dx1 - p1' dtheta1), where ' is a quarter turn. If n turns with body 1, it
+    changes by n' . d dtheta1, too.
+    """
+    places = [[None if body == GROUND else body_names.index(body) for body in element.bodies] for element in elements]
+
+    def slopes(q: np.ndarray) -> np.ndarray:
+        C = np.zeros((len(elements), *q.shape))
+        for k, (element, bodies) in enumerate(zip(elements, places, strict=True)):
+            for sign, body, values in zip((-1, 1), bodies, _slopes_of_one(element, bodies, q), strict=True):
+                if body is not None:
+                    C[k, 3 * body : 3 * body + 3] = sign * values
+        return C
+
+    return slopes
+
+
+def _slopes_of_one(element: Coordinate, bodies: Sequence[int | None], q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the derivatives (3, T) of a coordinate by the coordinates of body 2, and minus those by body 1's."""
+    if element.coordinate == "angle":
+        return np.array([[0.0], [0.0], [1.0]]), np.array([[0.0], [0.0], [1.0]])
+    poses = [np.zeros((3, q.shape[1])) if k is None else q[3 * k : 3 * k + 3] for k in bodies]
+    points = [0j, 0j] if element.points is None else [complex(x, y) for x, y in np.asarray(element.points).tolist()]
+    p1, p2 = (point * np.exp(1j * pose[2]) for point, pose in zip(points, poses, strict=True))
+    o1, o2 = (pose[0] + 1j * pose[1] for pose in poses)
+    d = o2 + p2 - o1 - p1
+    if element.coordinate == "distance":
+        n, turns = d / np.abs(d), 0.0
+    else:
+        axis = 0.0 if element.axis is None else float(element.axis)
+        n = np.exp(1j * (poses[0][2] + axis)) * (1.0 if element.coordinate == "x" else 1j)
+        turns = (np.conj(1j * n) * d).real
+    first, second = (np.stack([n.real, n.imag, (np.conj(n) * 1j * p).real - more]) for p, more in ((p1, turns), (p2, 0.0)))
+    return first, second
+
+
 @cached_by_identity
 def elements_of(mechanism: Mechanism, *drivers: str | Coordinate) -> tuple[Coordinate, ...]:
     """Return the coordinates of drivers, as `element_of`. Raises `SceneError`."""
@@ -117,5 +157,5 @@ def elements_of(mechanism: Mechanism, *drivers: str | Coordinate) -> tuple[Coord
     if not all(isinstance(driver, str) for driver in drivers):
         with jax.ensure_compile_time_eval():  # a mechanism checks coordinates, however they are given
             rows = {f"value{k + 1}": element.driver() for k, element in enumerate(elements)}
-            with_drivers(mechanism, rows)
+            mechanism.with_elements(mechanism.groups | {"driver": rows})
     return elements

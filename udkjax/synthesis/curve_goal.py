@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from udkjax.annotations import Numbers, NumericArray
-from udkjax.positions.following.kinematics import FULL_TURN
+from udkjax.arrays import FULL_TURN
 from udkjax.requirements import require_choice, require_count, require_text
 from udkjax.scene.mechanism import Mechanism
 from udkjax.synthesis.curves.comparison import CurveComparison, compare

@@ -8,13 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from udkjax.arrays import FULL_TURN
 from udkjax.equations.programs.position_programs import trace_model
 from udkjax.equations.rows.position_closure import CLOSURE
 from udkjax.expressions import Graph, ScalarProgram, trace
 from udkjax.positions.following.drive import Drive, drive
 from udkjax.positions.following.free_numbers import FreeNumbers, position_model
-from udkjax.positions.following.kinematics import FULL_TURN
-from udkjax.positions.following.position_batch import compile_programs, position_code
+from udkjax.positions.following.position_batch import compile_positions
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.tables.checks import SceneError
 from udkjax.synthesis.goals import Goal, PathGoal, goal_scale, place_of
@@ -123,8 +123,7 @@ class DesignProblem:
 
         def made(chosen, derivatives):
             choices = {"data": D, "derivatives": derivatives, "rows": rows, "chosen": chosen}
-            programs = compile_programs(self.mechanism, traced, self.unknowns, self.coordinates, **choices)
-            return programs, position_code(self.mechanism, programs)
+            return compile_positions(self.mechanism, traced, self.unknowns, self.coordinates, **choices)
 
         self._made, self._residual_count = made, G
         self._fit, self._fit_code = made(slice(G), True)

@@ -7,10 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from udkjax.arrays import FULL_TURN
 from udkjax.positions.assembling.channels import locate
 from udkjax.positions.following.drive import Drive
 from udkjax.positions.following.free_numbers import FreeNumbers
-from udkjax.positions.following.kinematics import FULL_TURN, kinematics
+from udkjax.positions.following.kinematics import kinematics
 from udkjax.printing import PrintedTable, PrintsTable
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.tables.checks import SceneError

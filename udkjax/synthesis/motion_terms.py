@@ -9,13 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from udkjax.arrays import FULL_TURN
 from udkjax.equations.programs.position_programs import trace_model
 from udkjax.equations.rows.position_closure import CLOSURE
 from udkjax.equations.terms.motion_measures import MotionModel
 from udkjax.positions.following.drive import Drive, Driven
 from udkjax.positions.following.free_numbers import FreeNumbers, position_model
-from udkjax.positions.following.kinematics import FULL_TURN, kinematics
-from udkjax.positions.following.position_batch import compile_programs, position_code
+from udkjax.positions.following.kinematics import kinematics
+from udkjax.positions.following.position_batch import compile_positions
 from udkjax.programs.deferred import deferred
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.tables.checks import SceneError
@@ -90,7 +91,7 @@ class CompiledTerm:
             return goal.measure(point(x, s, q, u, w, y, d)).reshape(1)
 
         n = mechanism.q0.size
-        programs = compile_programs(
+        programs, self._code = compile_positions(
             mechanism,
             trace_model(base, unknowns, n, D),
             unknowns,
@@ -101,7 +102,7 @@ class CompiledTerm:
             motion=MotionModel(psi, loads, measures),
         )
         self._model, self._driver = (psi, loads, measures), driver
-        self._code, self._drawn = position_code(mechanism, programs), programs.drawn_value
+        self._drawn = programs.drawn_value
         self._places, self.entries = programs.places[0], programs.measure.outputs[programs.places[0].by_parameters]
 
     def measures(

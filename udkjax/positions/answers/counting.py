@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from udkjax.arrays import ROUNDING
+from udkjax.arrays import FULL_TURN, ROUNDING
 from udkjax.positions.assembling.coordinates import Coordinate, element_of
 from udkjax.printing import format_number
 from udkjax.scene.drawing import Drawing
@@ -15,7 +15,6 @@ from udkjax.scene.elements.bodies import GROUND
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.tables.checks import SceneError
 
-FULL_TURN = 2.0 * math.pi
 DRAWN = 1e-10  # relative to the largest: smaller is rounding of a drawing's numbers, which editors write with twelve digits
 
 
@@ -54,7 +53,7 @@ class Count(NamedTuple):
             return cls(0.0, size, "deg", of, units)
         if len(mechanism.drawing.links[second].pins) < 2:
             return cls(0.0, size, "deg", f"the angle of {second}, from the drawn position", units)
-        start, end, offset = link_line(mechanism.drawing, second)
+        start, end, offset = _link_line(mechanism.drawing, second)
         return cls(offset, size, "deg", f"the angle of {start}-{end} from the x axis", units)
 
     @classmethod
@@ -125,7 +124,7 @@ class Count(NamedTuple):
         return float(found)
 
 
-def link_line(drawing: Drawing, link: str) -> tuple[str, str, float]:
+def _link_line(drawing: Drawing, link: str) -> tuple[str, str, float]:
     """Return the two pins whose line gives a link its angle in textbooks, and its difference from the body's angle (rad).
 
     The line begins at a pin on the ground if the link has one. A link of one pin has its body's angle.

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from udkjax.argument_types import HISTORY
+from udkjax.arrays import FULL_TURN
 from udkjax.positions.answers.transmission import transmission_angle
 from udkjax.positions.assembling.channels import StateHistory
 from udkjax.positions.assembling.coordinates import element_of
@@ -18,7 +19,7 @@ from udkjax.scene.elements.joints import Prismatic, Revolute
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.tables.checks import SceneError
 
-FULL_TURN = 2 * np.pi * (1 - 1e-9)  # (rad) a link with a larger swing makes full turns; the margin is for rounding
+ALL_ROUND = FULL_TURN * (1 - 1e-9)  # (rad) a link with a larger swing makes full turns; the margin is for rounding
 
 
 class MotionRanges(PrintsTable):
@@ -91,7 +92,7 @@ def range_lines(found: MotionRanges) -> dict[str, str]:
         for ranges in (found.swings, found.strokes, found.transmission_angles)
     )
     lines = {
-        name: "turns all the way round" if x > FULL_TURN else f"turns by {np.degrees(x):.4g} deg" for name, x in swings.items()
+        name: "turns all the way round" if x > ALL_ROUND else f"turns by {np.degrees(x):.4g} deg" for name, x in swings.items()
     }
     lines |= {name: f"slides by {x:.4g} m" for name, x in strokes.items()}
     for name, (least, largest) in angles.items():

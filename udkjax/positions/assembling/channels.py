@@ -35,7 +35,7 @@ _CENTRE: LocalPoint = (0.0, 0.0)  # the centre of mass, the origin of a body's f
 POINT_UNITS = {"x": "m", "y": "m", "vx": "m/s", "vy": "m/s", "ax": "m/s2", "ay": "m/s2"}
 _ANGLE_UNITS = {"angle": "rad", "omega": "rad/s", "alpha": "rad/s2"}
 LOADS = {"fx": "N", "fy": "N", "torque": "N m"}
-UNITS = {**POINT_UNITS, **_ANGLE_UNITS, **LOADS}
+_UNITS = {**POINT_UNITS, **_ANGLE_UNITS, **LOADS}
 RATES = ("vx", "vy", "omega")  # the rates of the coordinates of a body
 _ACCELERATIONS = ("ax", "ay", "alpha")
 
@@ -209,7 +209,7 @@ def _parse_body(mechanism: Mechanism, text: str) -> Channel:
     known = POINT_UNITS if point is not _CENTRE else {**POINT_UNITS, **_ANGLE_UNITS}
     quantity = _check_quantity(f"body {quote(shown)}", rest, known)
     needs: Needs = "accelerations" if quantity in _ACCELERATIONS else "states"
-    return Channel(f"body.{shown}.{quantity}", UNITS[quantity], needs, "body", "", (name,), (point,), quantity)
+    return Channel(f"body.{shown}.{quantity}", _UNITS[quantity], needs, "body", "", (name,), (point,), quantity)
 
 
 def _parse_joint(mechanism: Mechanism, text: str) -> Channel:
@@ -218,12 +218,12 @@ def _parse_joint(mechanism: Mechanism, text: str) -> Channel:
     for body in sorted(bodies, key=len, reverse=True):
         if rest.startswith(f".{body}."):
             quantity = _check_quantity(f"joint {quote(name)} on body {quote(body)}", rest.removeprefix(f".{body}"), LOADS)
-            return Channel(f"joint.{name}.{body}.{quantity}", UNITS[quantity], "reactions", "joint", name, (body,), (), quantity)
+            return Channel(f"joint.{name}.{body}.{quantity}", _UNITS[quantity], "reactions", "joint", name, (body,), (), quantity)
     pair = bodies[:2]
     places = POINT_UNITS if has_point(mechanism.joints[name]) else {}
     known = {**places, **(_ANGLE_UNITS if len(pair) == 2 else {}), **LOADS}
     quantity = _check_quantity(f"joint {quote(name)}", rest, known, [f"{b}.{q}" for b in bodies for q in LOADS])
-    units, label = UNITS[quantity], f"joint.{name}.{quantity}"
+    units, label = _UNITS[quantity], f"joint.{name}.{quantity}"
     if quantity in LOADS:
         return Channel(label, units, "reactions", "joint", name, pair[-1:], (), quantity)
     needs: Needs = "accelerations" if quantity in _ACCELERATIONS else "states"
@@ -235,7 +235,7 @@ def _parse_pin(mechanism: Mechanism, text: str) -> Channel:
     quantity = _check_quantity(f"pin {quote(name)}", rest, POINT_UNITS)
     needs: Needs = "accelerations" if quantity in _ACCELERATIONS else "states"
     body, _ = point_of_pin(mechanism, name)
-    return Channel(f"pin.{name}.{quantity}", UNITS[quantity], needs, "pin", name, (body,), (), quantity)
+    return Channel(f"pin.{name}.{quantity}", _UNITS[quantity], needs, "pin", name, (body,), (), quantity)
 
 
 def _parse_driver(mechanism: Mechanism, text: str) -> Channel:

@@ -1,6 +1,6 @@
 """Coordinates that can be driven, by the name of a driver, by the name of a channel, or as objects."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, Literal, cast, get_args
 
 import equinox as eqx
@@ -92,45 +92,6 @@ def value_of(mechanism: Mechanism, coordinate: str | Coordinate) -> Callable[[Ar
         return element.value(*(GROUND_FRAME if k is None else Frame.at(rows[k, :2], rows[k, 2]) for k in places))
 
     return value
-
-
-def slopes_of(elements: Sequence[Coordinate], body_names: Sequence[str]) -> Callable[[np.ndarray], np.ndarray]:
-    """Return the derivatives C (k, n, T) of coordinates by q, as a function of q (n, T), by NumPy.
-
-    With p the vectors from the origins of the bodies to their points, n the direction of the coordinate, and d from point 1 to
-    point 2, it changes by n . (dx2 + p2' dtheta2 - dx1 - p1' dtheta1), where ' is a quarter turn. If n turns with body 1, it
-    changes by n' . d dtheta1, too.
-    """
-    places = [[None if body == GROUND else body_names.index(body) for body in element.bodies] for element in elements]
-
-    def slopes(q: np.ndarray) -> np.ndarray:
-        C = np.zeros((len(elements), *q.shape))
-        for k, (element, bodies) in enumerate(zip(elements, places, strict=True)):
-            for sign, body, values in zip((-1, 1), bodies, _slopes(element, bodies, q), strict=True):
-                if body is not None:
-                    C[k, 3 * body : 3 * body + 3] = sign * values
-        return C
-
-    return slopes
-
-
-def _slopes(element: Coordinate, bodies: Sequence[int | None], q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the derivatives (3, T) of a coordinate by the coordinates of body 2, and minus those by body 1's."""
-    if element.coordinate == "angle":
-        return np.array([[0.0], [0.0], [1.0]]), np.array([[0.0], [0.0], [1.0]])
-    poses = [np.zeros((3, q.shape[1])) if k is None else q[3 * k : 3 * k + 3] for k in bodies]
-    points = [0j, 0j] if element.points is None else [complex(x, y) for x, y in np.asarray(element.points).tolist()]
-    p1, p2 = (point * np.exp(1j * pose[2]) for point, pose in zip(points, poses, strict=True))
-    o1, o2 = (pose[0] + 1j * pose[1] for pose in poses)
-    d = o2 + p2 - o1 - p1
-    if element.coordinate == "distance":
-        n, turns = d / np.abs(d), 0.0
-    else:
-        axis = 0.0 if element.axis is None else float(element.axis)
-        n = np.exp(1j * (poses[0][2] + axis)) * (1.0 if element.coordinate == "x" else 1j)
-        turns = (np.conj(1j * n) * d).real
-    first, second = (np.stack([n.real, n.imag, (np.conj(n) * 1j * p).real - more]) for p, more in ((p1, turns), (p2, 0.0)))
-    return first, second
 
 
 def element_of(mechanism: Mechanism, driver: str | Coordinate) -> Coordinate:

@@ -100,7 +100,7 @@ def _drive(mechanism: Mechanism, driver: Drive, t: NumberLike, held: Mapping[str
         analysis = analyse(mechanism)
         if not mechanism.drivers and analysis.degrees_of_freedom != 0:  # or unknown, since numbers are traced
             problem = "driver is None, and the scene has no driver: name a coordinate that drives it, such as"
-            raise SceneError([f"{problem} {suggested_coordinate(mechanism)}"], mechanism.name)
+            raise SceneError([f"{problem} {_suggested_coordinate(mechanism)}"], mechanism.name)
         _require_determinate(mechanism, analysis, "all drivers")
         rate = analysis.scales.rate
         return Driven(mechanism.without_origin, analysis, "", -1, jnp.where(rate > 0, 1 / jnp.where(rate > 0, rate, 1.0), 1.0))
@@ -136,10 +136,12 @@ def constant_speed(mechanism: Mechanism, driver: str) -> float:
 def only_driver(mechanism: Mechanism) -> str:
     """Return the name of the only driver; raise `SceneError` unless there is exactly one."""
     names = mechanism.driver_names
-    if len(names) != 1:
-        choices = f"there are {', '.join(names)}" if names else "there is none in the scene"
-        raise SceneError([f"driver: name the driver or a coordinate, such as body.crank.angle: {choices}"], mechanism.name)
-    return names[0]
+    if len(names) == 1:
+        return names[0]
+    problem = f"the scene has {len(names)} drivers; name one of {', '.join(names)}"
+    if not names:
+        problem = f"the scene has no driver; name a coordinate, such as {_suggested_coordinate(mechanism)}"
+    raise SceneError([f"driver: {problem}"], mechanism.name)
 
 
 def without_drivers(mechanism: Mechanism, forces: Mapping[str, ForceElement] | None = None) -> Mechanism:
@@ -250,7 +252,7 @@ def free_motion(mechanism: Mechanism) -> dict[str, Bool[np.ndarray, "3"]]:
     return dict(zip(mechanism.body_names, moves, strict=True))
 
 
-def suggested_coordinate(mechanism: Mechanism) -> str:
+def _suggested_coordinate(mechanism: Mechanism) -> str:
     """Return the name of a coordinate that moves and can be driven, preferably an angle; any if numbers are traced."""
     moves = free_motion(mechanism) if mechanism.is_concrete else {}
     free = [f"body.{body}.{name}" for k, name in ((2, "angle"), (0, "x"), (1, "y")) for body in moves if moves[body][k]]

@@ -12,7 +12,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from udkjax.annotations import NumberLike, Numbers
 from udkjax.argument_types import FINITE, NUMBERS_BY_NAME
-from udkjax.arrays import is_traced, library_for, make_module, number, stored, without_derivatives
+from udkjax.arrays import FULL_TURN, is_traced, library_for, make_module, number, stored, without_derivatives
 from udkjax.equations.rows.analysis import Analysis, analyse
 from udkjax.positions.assembling.assembly import State, assemble, close
 from udkjax.positions.assembling.coordinates import element_of
@@ -33,7 +33,6 @@ from udkjax.scene.tables.checks import SceneError
 from udkjax.transforms.gradients import stop_gradients
 
 UNLIMITED_TRAVEL = 500.0  # in characteristic lengths: a coordinate that gets this far without a toggle has no limit
-FULL_TURN = 2.0 * np.pi  # rad
 
 
 class Kinematics(PrintsTable):

@@ -78,11 +78,11 @@ class PositionBatch:
         coordinates = 3 * len(mechanism.body_names)
         model = position_model(self.free, driver, lambda *_: jnp.zeros(0))
         traced = trace_model(model, self.free.count, coordinates)
-        self._programs = compile_programs(
+        self._programs, self._code = compile_positions(
             mechanism, traced, self.free.count, coordinates, positions=True, derivatives=derivatives,
             rows=np.asarray(self._driven.analysis.scales.rows),
         )  # fmt: skip
-        self._code, self._unit = position_code(mechanism, self._programs), coordinate_units(self._driven)
+        self._unit = coordinate_units(self._driven)
 
     def __call__(
         self,
@@ -133,19 +133,18 @@ def coordinate_units(driven: Driven) -> Float[np.ndarray, "n"]:
     return np.asarray(driven.analysis.scales.coordinates(driven.analysis.coordinates))
 
 
-def compile_programs(
+def compile_positions(
     mechanism: Mechanism, model: TracedModel, parameters: int, coordinates: int, **choices: Any
-) -> PositionPrograms:
-    """Return the programs of a model; raise `SceneError` if positions do not follow from the driver."""
+) -> tuple[PositionPrograms, PositionCode]:
+    """Return the programs of a model, and their machine code.
+
+    Raises `SceneError` if positions do not follow from the driver, or an operation has no instruction.
+    """
     try:
-        return PositionPrograms(model, parameters, coordinates, **choices)
+        programs = PositionPrograms(model, parameters, coordinates, **choices)
     except ValueError as problem:
         raise SceneError([f"positions do not follow from the driver: {problem}"], mechanism.name) from None
-
-
-def position_code(mechanism: Mechanism, programs: PositionPrograms) -> PositionCode:
-    """Return the machine code of programs; raise `SceneError` if an operation has no instruction."""
     try:
-        return PositionCode(programs)
+        return programs, PositionCode(programs)
     except UnsupportedError as problem:
         raise SceneError([f"machine code has no instruction for {problem}"], mechanism.name) from None

@@ -11,9 +11,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from udkjax.arrays import FULL_TURN
 from udkjax.positions.assembling.channels import StateHistory
 from udkjax.positions.assembling.coordinates import Coordinate, value_of
-from udkjax.positions.following.kinematics import FULL_TURN, kinematics, travel
+from udkjax.positions.following.kinematics import kinematics, travel
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.tables.checks import SceneError
 

@@ -13,14 +13,14 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from udkjax.annotations import Numbers
+from udkjax.arrays import FULL_TURN
 from udkjax.equations.programs.position_programs import trace_model
 from udkjax.equations.rows.position_closure import CLOSURE
 from udkjax.positions.assembling.channels import locate
 from udkjax.positions.assembling.coordinates import value_of
 from udkjax.positions.following.drive import Drive, drive
 from udkjax.positions.following.free_numbers import position_model
-from udkjax.positions.following.kinematics import FULL_TURN
-from udkjax.positions.following.position_batch import compile_programs, position_code
+from udkjax.positions.following.position_batch import compile_positions
 from udkjax.scene.elements.bodies import GROUND, Frame
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.tables.checks import SceneError
@@ -192,13 +192,12 @@ class Measuring:
 
         model: Any = position_model(numbers, self.driver, measures)  # pyright: ignore[reportArgumentType]
         coordinates, D = 3 * len(numbers.mechanism.body_names), self._data.shape[1]
-        programs = compile_programs(
+        _, self._code = compile_positions(
             numbers.mechanism, trace_model(model, numbers.count, coordinates, D), numbers.count, coordinates, data=D,
             transmission=False, derivatives=False, rows=np.asarray(driven.analysis.scales.rows),
         )  # fmt: skip
         analysis = driven.analysis
         self._unit = np.asarray(analysis.scales.coordinates(analysis.coordinates))
-        self._code = position_code(numbers.mechanism, programs)
 
     def _read(self, x: np.ndarray) -> Float[np.ndarray, "N T columns"]:
         longest = CLOSURE.longest_step * float(self._driven.unit)

@@ -6,7 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from udkjax.positions.answers.counting import link_line
+from udkjax.arrays import FULL_TURN
+from udkjax.positions.answers.counting import Count
 from udkjax.positions.assembling.coordinates import Coordinate
 from udkjax.scene.drawing import Drawing
 from udkjax.scene.elements.bodies import GROUND
@@ -16,7 +17,6 @@ from udkjax.scene.tables.checks import SceneError
 from udkjax.wording import quote
 
 NOTHING = 1e-9  # relative to the extent of the pins: vectors and offsets that are shorter are left out
-TURN = 2 * np.pi
 MOST_SEARCHED = 16  # bodies of which groups are looked for; there are 2^16
 
 
@@ -85,12 +85,17 @@ class Geometry:
         mechanism: a drawn mechanism of pins, slides and slots.
         q: coordinates (bodies, 3) of the position.
         driven: the driven coordinate, of a link or slide on the ground.
+
+    Attributes:
+        angles: angle of each body (rad): that of its first vector, from its pin on the ground if it has one.
     """
 
     def __init__(self, mechanism: Mechanism, q: np.ndarray, driven: Coordinate):
         drawing = drawing_of(mechanism)
         self.mechanism, self.drawing, self.driven = mechanism, drawing, driven
         self.frames = dict(zip(mechanism.body_names, q, strict=True)) | {GROUND: np.zeros(3)}
+        offsets = {body: Count.of(mechanism, Coordinate((GROUND, body))).offset for body in mechanism.body_names} | {GROUND: 0.0}
+        self.angles = {body: wrapped(float(frame[2]) + offsets[body]) for body, frame in self.frames.items()}
         self.connections = list(_connections(mechanism, drawing))
         self.places = {joint.pin: self._place(joint) for joint in self.connections}
         self.extent = float(np.max(np.ptp(np.array([*self.places.values()]), axis=0), initial=0.0)) or 1.0
@@ -119,10 +124,6 @@ class Geometry:
         sign = -1.0 if along @ arms[start] < 0 else 1.0
         return start, float(np.arctan2(sign * along[1], sign * along[0])), sign * offsets[start]
 
-    def angle(self, body: str) -> float:
-        """Return the angle of a body (rad): that of its first vector, from its pin on the ground if it has one."""
-        return wrapped(float(self.frames[body][2]) + (0.0 if body == GROUND else link_line(self.drawing, body)[2]))
-
     def root(self, body: str) -> str:
         """Return the body with which a body keeps its angle because it slides on it, directly or through others."""
         for joint in self.connections:
@@ -137,7 +138,7 @@ class Geometry:
         if size <= NOTHING * self.extent:
             return []
         root = self.root(body)
-        turn = wrapped(float(np.arctan2(arm[1], arm[0])) - self.angle(root))
+        turn = wrapped(float(np.arctan2(arm[1], arm[0])) - self.angles[root])
         is_against = abs(abs(turn) - np.pi) < NOTHING if root != GROUND else turn > 0.5 * np.pi + NOTHING or turn < -0.5 * np.pi
         if is_against:
             return [LoopVector(end, start, -1.0, root, _tidy(wrapped(turn + np.pi)), size)]
@@ -147,7 +148,7 @@ class Geometry:
         """Return the vectors from the pin from which a line is counted to the sliding pin: across the line, and along it."""
         start, way, offset = self.lines[joint.name]
         root = self.root(joint.bodies[0])
-        turn = wrapped(way - self.angle(root))
+        turn = wrapped(way - self.angles[root])
         arm = self.places[joint.pin] - self.places[start]
         size = float(arm @ [np.cos(way), np.sin(way)])
         foot, found = start, []
@@ -170,7 +171,7 @@ class Geometry:
 
 def wrapped(angle: float) -> float:
     """Return an angle (rad) above minus half a turn, and at most half a turn."""
-    return float(np.pi - (np.pi - angle) % TURN)
+    return float(np.pi - (np.pi - angle) % FULL_TURN)
 
 
 def _tidy(angle: float) -> float:

@@ -122,7 +122,7 @@ def worked_solution(mechanism: Mechanism, at: NumberLike | str, digits: int = 6,
     names = mechanism.body_names
     fastest = [PRINTED_AS_ZERO * float(np.max(np.abs(x[:, 2]), initial=0.0)) for x in (v, a)]
     rates = [np.where(np.abs(x[:, 2]) > least, x[:, 2], 0.0) for x, least in zip((v, a), fastest, strict=True)]
-    angles = {name: (geometry.angle(name), float(rates[0][k]), float(rates[1][k])) for k, name in enumerate(names)}
+    angles = {name: (geometry.angles[name], float(rates[0][k]), float(rates[1][k])) for k, name in enumerate(names)}
     slides = {joint.name: _slide(geometry, joint.name, v, a) for joint in geometry.connections if joint.slides}
     pins = {joint.name: joint.pin for joint in geometry.connections}
     symbols = PositionSymbols(PositionRates(angles, slides), pins)

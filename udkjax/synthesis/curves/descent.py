@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from udkjax.arrays import FULL_TURN
 from udkjax.synthesis.curves.comparison import compare
 from udkjax.synthesis.curves.dyad_forms import RAIL, SLIDE
 from udkjax.synthesis.curves.dyads import (
@@ -24,7 +25,6 @@ from udkjax.synthesis.curves.dyads import (
 )
 from udkjax.synthesis.curves.targets import CurveTarget
 
-FULL_TURN = 2.0 * np.pi
 LONGEST_MOVE = 0.5  # largest change of a number in one step (RMS radii of the target, rad)
 LEAST_SPAN = 0.7  # smallest part of a turn that may draw the curve (rad)
 REACH = 50.0  # largest coordinate of a place on its link; joints are limited by their distance from the target

@@ -6,8 +6,9 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
+from udkjax.arrays import FULL_TURN
 from udkjax.positions.following.drive import Drive
-from udkjax.positions.following.kinematics import FULL_TURN, Kinematics, kinematics
+from udkjax.positions.following.kinematics import Kinematics, kinematics
 from udkjax.printing import PrintsTable, format_numbers
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.numbers.sources import AbstractDrawing

@@ -6,9 +6,10 @@ from typing import Any
 
 import numpy as np
 
+from udkjax.arrays import FULL_TURN
 from udkjax.equations.states.quantities import violation
 from udkjax.positions.assembling.channels import locate
-from udkjax.positions.following.kinematics import FULL_TURN, kinematics
+from udkjax.positions.following.kinematics import kinematics
 from udkjax.scene.drawing import Drawing
 from udkjax.scene.drawing.drawn_quantities import Units
 from udkjax.scene.elements.bodies import GROUND

@@ -4,7 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from udkjax.synthesis.curves.descent import FULL_TURN, LinkageLimits
+from udkjax.arrays import FULL_TURN
+from udkjax.synthesis.curves.descent import LinkageLimits
 from udkjax.synthesis.curves.dyad_forms import RAIL
 from udkjax.synthesis.curves.dyads import BASE, EACH, HEAD, PHASE, SECOND, SPAN, Topology, positions
 from udkjax.synthesis.curves.random_linkages import Linkages, random_linkages, turn_angles

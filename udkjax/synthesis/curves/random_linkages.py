@@ -7,7 +7,8 @@ below the smallest distance of P and Q. Numbers are drawn within these limits, s
 
 import numpy as np
 
-from udkjax.synthesis.curves.descent import FULL_TURN, Sampling
+from udkjax.arrays import FULL_TURN
+from udkjax.synthesis.curves.descent import Sampling
 from udkjax.synthesis.curves.dyad_forms import PINS, RAIL, SLIDE, cross
 from udkjax.synthesis.curves.dyads import (
     BASE,

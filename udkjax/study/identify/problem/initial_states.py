@@ -14,7 +14,7 @@ from udkjax.equations.rows.dense_rows import KinematicRows
 from udkjax.equations.systems.general import ConstrainedSystem
 from udkjax.pinv.row_spaces import null_space
 from udkjax.positions.assembling.assembly import State, assemble
-from udkjax.positions.assembling.channels import RATES, UNITS
+from udkjax.positions.assembling.channels import RATES, channel_of
 from udkjax.scene.elements.bodies import COORDINATES
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.tables.checks import SceneError
@@ -105,8 +105,9 @@ def state_unknowns(mech: StudyModel, t0: float, guess: State | None, estimate: E
     for kind, fields, factor, part in kinds:
         if estimate in (kind, "both"):
             sizes.append(factor * size)
-            names += [f"{label}: body.{mech.body_names[k // 3]}.{fields[k % 3]}" for k in chosen]
-            units += [UNITS[fields[k % 3]] for k in chosen]
+            channels = [channel_of(mech, f"body.{mech.body_names[k // 3]}.{fields[k % 3]}") for k in chosen]
+            names += [f"{label}: {channel.name}" for channel in channels]
+            units += [channel.units for channel in channels]
             parts.append(np.stack(part))
     return InitialStateUnknowns(tuple(names), tuple(units), np.concatenate(sizes), np.concatenate(parts, axis=2))
 
