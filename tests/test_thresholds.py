@@ -253,7 +253,7 @@ CASES: dict[str, tuple[Callable[[], dict[str, Any]], tuple[str, ...], float]] = 
     "HIDES": (hidden_numbers, ("study.tolerancing.dimensions.HIDES",), 0.0),
     **{
         name: (least_gaps, (f"positions.gaps.{name}",), 1e-9)
-        for name in ("search.PROVEN", "search.OPENED", "search.BESIDE", "motion.FOLLOWED")
+        for name in ("search.PROVEN", "search.OPENED", "search.BESIDE", "search.LAST_STEP", "motion.FOLLOWED")
     },
     "JAMMING_TIMES": (jams, ("integrate.causes.jamming.JAMMING_TIMES",), 0.0),
 }

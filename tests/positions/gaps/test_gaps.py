@@ -1,6 +1,8 @@
 """Least gaps between links: closed forms, other methods on random linkages, derivatives, contacts, and wrong input."""
 
 import json
+from itertools import combinations
+from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -13,7 +15,7 @@ pytest.importorskip("experiments", reason="not in a source tree")
 import udkjax as udk
 from experiments.parts.gap_linkages import placed, random_linkage
 from tests.command_line import udkjax
-from udkjax.positions.gaps.convex import feature, gap_at, signed_distance
+from udkjax.positions.gaps.convex import closest, gap_at, signed_distance
 from udkjax.positions.gaps.pairs import joined_pairs
 from udkjax.positions.gaps.shapes import convex_pieces, hull
 
@@ -49,30 +51,55 @@ def by_directions(A, B):
     )
 
 
-@pytest.mark.parametrize("counts", [(1, 1), (1, 2), (2, 2), (1, 4), (2, 5), (5, 3)])
-def test_signed_distances_are_maxima_over_directions(counts):
-    rng = np.random.default_rng(sum(counts))
+def figures(counts, number, rng):
+    """Random convex figures of two numbers of corners."""
     shapes = []
     for count in counts:
         found = []
-        while len(found) < 60:
+        while len(found) < number:
             points = rng.normal(size=(count, 2))
             if len(corners := hull(points)) == count:
                 found.append(points[corners] + rng.normal(size=2))
         shapes.append(np.stack(found, -1))
-    A, B = shapes
+    return shapes
+
+
+@pytest.mark.parametrize("counts", [(1, 1), (1, 2), (2, 2), (1, 4), (2, 5), (5, 3)])
+def test_signed_distances_are_maxima_over_directions(counts):
+    A, B = figures(counts, 60, np.random.default_rng(sum(counts)))
     got = signed_distance(A, B)
     wanted = np.array([by_directions(A[..., k], B[..., k]) for k in range(A.shape[-1])])
     assert np.abs(got - wanted).max() < 1e-7
     if min(counts) > 1:
         assert (got < 0).sum() > 5 and (got > 0).sum() > 5
-    found, k = feature(A, B), np.arange(A.shape[-1])
+    k = np.arange(A.shape[-1])
+    found = closest(A, B).features(counts, k)
     for of_a, one, other in ((True, A, B), (False, B, A)):
         some = k[found.of_a == of_a]
         f, places = found.take(some), (one, other, other)
         points = (x[c, :, some].T for x, c in zip(places, found.take(some)[1:4], strict=True))
         distance, n, _ = gap_at(*points, f.side, f.at)
         assert np.allclose(distance, got[some], atol=1e-14) and np.allclose(np.hypot(*n), 1.0)
+
+
+@pytest.mark.parametrize("counts", [(1, 1), (2, 2), (5, 3), (3, 3), (6, 6)])
+def test_closest_features_and_directions_have_the_distance(counts):
+    """Also where corners are closest that no edge of the one figure separates from the other one, and one above the other."""
+    A, B = figures(counts, 400, np.random.default_rng(7))
+    A[..., :20], B[..., :20] = 0.1 * A[..., :20], 0.1 * B[..., :20]
+    B[:, :, :20] += (A[:, :, :20].mean(0) - B[:, :, :20].mean(0)) + np.array([[0.0], [5.0]])  # above
+    found, k = closest(A, B), np.arange(400)
+    n = found.n
+    supported = (n[0] * B[:, 0] + n[1] * B[:, 1]).min(0) - (n[0] * A[:, 0] + n[1] * A[:, 1]).max(0)
+    assert np.allclose(supported, found.distance, atol=1e-14) and np.allclose(np.hypot(*n), 1.0)
+    features = found.features(counts, k)
+    for of_a, one, other in ((True, A, B), (False, B, A)):
+        some = k[features.of_a == of_a]
+        f = features.take(some)
+        p, start, end = (x[c, :, some].T for x, c in zip((one, other, other), f[1:4], strict=True))
+        distance, way, _ = gap_at(p, start, end, f.side, f.at)
+        assert np.allclose(distance, found.distance[some], atol=1e-14)
+        assert np.allclose(way, (-1.0 if of_a else 1.0) * n[:, some], atol=1e-9)
 
 
 def test_collinear_segments_are_apart_whatever_their_direction():
@@ -128,6 +155,30 @@ def test_no_gap_between_samples_is_smaller(seeds):
             assert gap.distance <= least + 1e-12 * size and gap.bound <= gap.distance <= gap.bound + 2e-9 * (size + 2)
             overlaps += gap.distance < 0
     assert overlaps > 3
+
+
+def test_gaps_that_are_constant_are_proven():
+    """In a planetary gear all gaps are constant; pins of one link, at which two others are closest, stay as far apart."""
+    gear = udk.load(Path(__file__).parents[3] / "examples/planetary_gear.toml")
+    names = gear.body_names
+    run = udk.simulate(gear, np.linspace(0.0, 1.0, 100))
+    found = udk.gaps(gear, run=run, shapes=dict.fromkeys(names, 0.02), pairs=list(combinations(names, 2)))
+    mech, values = random_linkage(8)
+    shared = udk.gaps(mech, "motor", values=values, pairs=[("crank", "rod"), ("crank", "plate")])
+    assert len(found.pairs) == 10
+    for gap in (*found.pairs, *shared.pairs):
+        assert gap.distance - 2e-9 < gap.bound <= gap.distance, gap.pair
+
+
+def test_points_of_least_gaps_are_as_far_apart_as_the_links():
+    """Of outlines that are not convex, too."""
+    star = np.array(
+        [[np.cos(a) * r, np.sin(a) * r] for a, r in zip(np.linspace(0, 2 * np.pi, 11)[:-1], [0.3, 0.12] * 5, strict=True)]
+    )
+    for seed in (13, 3):
+        mech, values = random_linkage(seed)
+        for gap in udk.gaps(mech, "motor", values=values, shapes={"rocker": star}).pairs:
+            assert np.hypot(*np.diff(gap.points, axis=0)[0]) == pytest.approx(abs(gap.distance), abs=1e-12), (seed, gap.pair)
 
 
 def test_contacts_are_located():

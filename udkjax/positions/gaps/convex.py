@@ -5,6 +5,7 @@ caller. With n from figure A to figure B, the signed distance is the largest ove
 separate figures, and minus the shortest way out of each other if they overlap. The last axis of all arrays counts cases.
 """
 
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,6 +13,7 @@ from jaxtyping import Bool, Float, Int
 
 from udkjax.arrays import array_namespace
 
+FEW_ROWS = 8  # up to which least numbers are found row by row
 Corners = Float[np.ndarray, "V 2 N"]
 
 
@@ -30,66 +32,154 @@ class Feature(NamedTuple):
         return Feature(*(x[k] for x in self))
 
 
-class _Places(NamedTuple):
-    """Distances of corners from edges: to the left, before the start, after the end (V, E, N); and separations (E, N)."""
+class Closest(NamedTuple):
+    """Signed distances (N) of figures, unit vectors n (2, N) from A to B, and the closest features.
+
+    `row` numbers pairs of a corner and an edge, those of corners of A first; `side` and `at` are those of `Feature`.
+    """
+
+    distance: Any
+    n: Any
+    row: Any
+    side: Any
+    at: Any
+
+    def features(self, counts: tuple[int, int], k: Any) -> Feature:
+        """Return the features of the cases k of figures with so many corners."""
+        row = self.row[k]
+        of_a, corner, edge, end = (x[row] for x in _feature_table(*counts)[:4])
+        return Feature(of_a, corner, edge, end, self.side[k], self.at[k])
+
+
+class _FeatureTable(NamedTuple):
+    """Pairs of a corner and an edge: whether the corner is one of A, the corner, the edge's start and end, and its place in a
+    list of all edges."""
+
+    of_a: Any
+    corner: Any
+    start: Any
+    end: Any
+    edge: Any
+
+
+@lru_cache
+def _feature_table(count_a: int, count_b: int) -> _FeatureTable:
+    found, edges = [], 0
+    for of_a, count, corners in _sides_of(count_a, count_b):
+        number = corners if corners > 2 else 1
+        found += [(of_a, i, j, (j + 1) % corners, edges + j) for i in range(count) for j in range(number)]
+        edges += number
+    return _FeatureTable(*(np.array(x) for x in zip(*found, strict=True)))
+
+
+def _sides_of(count_a: int, count_b: int) -> list[tuple[bool, int, int]]:
+    """Return whose corners are compared with the edges of the other one, and the numbers of corners of both."""
+    both = [(True, count_a, count_b), (False, count_b, count_a)]
+    return [x for x in both if x[2] > 1] or both[:1]
+
+
+class _CornerPlaces(NamedTuple):
+    """Places of corners, from edges: to the left, along them from the start, and past the end (V, E, N).
+
+    Of the edges (E, N): unit vectors, and how far they separate the figures.
+    """
 
     left: Any
-    before: Any
-    after: Any
+    along: Any
+    past: Any
+    ex: Any
+    ey: Any
     apart: Any
 
-    @property
-    def square(self) -> Any:
-        """The squares of the distances."""
-        beyond = np.maximum(np.maximum(self.before, self.after), 0.0)
-        return self.left * self.left + beyond * beyond
 
-
-def _places(points: Corners, corners: Corners) -> _Places:
-    count = len(corners)
-    start = corners if count > 2 else corners[:1]
-    way = np.roll(corners, -1, axis=0)[: len(start)] - start
-    length = np.sqrt(way[:, 0] ** 2 + way[:, 1] ** 2)
-    safe = np.where(length > 0, length, 1.0)
-    ex, ey = np.where(length > 0, way[:, 0] / safe, 1.0), way[:, 1] / safe
+def _corner_places(points: Corners, corners: Corners) -> _CornerPlaces:
+    start = corners if len(corners) > 2 else corners[:1]
+    way = np.concatenate([corners[1:], corners[:1]])[: len(start)] - start
+    length = np.sqrt(way[:, 0] * way[:, 0] + way[:, 1] * way[:, 1])
+    safe = np.maximum(length, np.finfo(float).tiny)
+    ex, ey = way[:, 0] / safe, way[:, 1] / safe
+    if not length.all():
+        ex = np.where(length > 0, ex, 1.0)
     x, y = points[:, None, 0] - start[:, 0], points[:, None, 1] - start[:, 1]
-    left, before = ex * y - ey * x, -(ex * x + ey * y)
-    after, apart = -before - length, -left.max(0)
-    if count <= 2:  # a segment has two sides, and ends: rounding decides on which side collinear segments are
-        apart = np.maximum(np.maximum(apart, left.min(0)), np.maximum(before.min(0), after.min(0)))
-    return _Places(left, before, after, apart)
+    left, along = ex * y - ey * x, ex * x + ey * y
+    past, apart = along - length, -left.max(0)
+    if len(corners) <= 2:  # a segment has two sides, and ends: rounding decides on which side collinear segments are
+        apart = np.maximum(np.maximum(apart, left.min(0)), np.maximum(-along.max(0), past.min(0)))
+    return _CornerPlaces(left, along, past, ex, ey, apart)
 
 
 def signed_distance(A: Corners, B: Corners) -> Float[np.ndarray, "N"]:
     """Return the signed distances of figures A and B."""
-    if len(A) == len(B) == 1:
-        return np.hypot(*(B[0] - A[0]))
-    sides = [_places(*pair) for pair in ((A, B), (B, A)) if len(pair[1]) > 1]
-    apart = np.max([x.apart.max(0) for x in sides], axis=0)
-    return np.where(apart < 0, apart, np.sqrt(np.min([x.square.min((0, 1)) for x in sides], axis=0)))
+    return closest(A, B).distance
 
 
-def feature(A: Corners, B: Corners) -> Feature:
-    """Return the closest features of figures A and B, or, if they overlap, those of the shortest way out."""
-    k, found = np.arange(A.shape[-1]), []
-    for points, corners in ((A, B), (B, A)):
-        if len(corners) == 1 < len(points):
-            continue
-        places, edges = _places(points, corners), max(1, len(corners) - (len(corners) == 2))
-        square = places.square.reshape(-1, len(k))
-        near, best = square.argmin(0), places.apart.argmax(0)
-        apart, left = places.apart[best, k], places.left[:, best, k]
-        right = (-left.max(0) >= left.min(0)) | (len(corners) > 2)
-        is_out = apart >= 0
-        corner = np.where(is_out, near // edges, np.where(right, left.argmax(0), left.argmin(0)))
-        edge = np.where(is_out, near % edges, best)
-        at = np.where(places.before[corner, edge, k] > 0, 1, np.where(places.after[corner, edge, k] > 0, 2, 0)) * is_out
-        side = np.where(np.where(is_out, places.left[corner, edge, k] <= 0, right), 1.0, -1.0)
-        of_a = np.full(len(k), points is A)
-        found.append((apart, square[near, k], Feature(of_a, corner, edge, (edge + 1) % len(corners), side, at)))
-    (apart, square, one), (apart_b, square_b, other) = found[0], found[-1]
-    first = np.where(np.maximum(apart, apart_b) < 0, apart >= apart_b, square <= square_b)
-    return Feature(*(np.where(first, x, y) for x, y in zip(one, other, strict=True)))
+def closest(A: Corners, B: Corners) -> Closest:
+    """Return the signed distances of figures A and B, and their closest features.
+
+    If figures overlap, these are the features of the shortest way out of each other.
+    """
+    count, rows = A.shape[-1], _feature_table(len(A), len(B))
+    sides = [_corner_places(*((A, B) if of_a else (B, A))) for of_a, *_ in _sides_of(len(A), len(B))]
+    left, along, past = (_joined([x[k].reshape(-1, count) for x in sides]) for k in range(3))
+    edge_x, edge_y, apart = (_joined([x[k] for x in sides]) for k in range(3, 6))
+    beyond = np.maximum(np.maximum(-along, past), 0.0)
+    row = _first_least(left * left + beyond * beyond)
+    separation = apart.max(0)
+    overlap = np.flatnonzero(separation < 0)
+    right = np.ones(len(overlap), bool)
+    if len(overlap):
+        row[overlap], right = _ways_out([(x.left[..., overlap], x.apart[:, overlap]) for x in sides])
+    every = np.arange(count)
+    here, edge = row * count + every, rows.edge.take(row) * count + every
+    to_left, a, p = left.take(here), along.take(here), past.take(here)
+    ex, ey = edge_x.take(edge), edge_y.take(edge)
+    side, b = np.where(to_left <= 0, 1.0, -1.0), np.minimum(a, 0.0) + np.maximum(p, 0.0)
+    at = np.where(a < 0, 1, np.where(p > 0, 2, 0)) if max(len(A), len(B)) > 1 else np.ones(count, int)
+    distance = np.sqrt(to_left * to_left + b * b)
+    along_edge = distance == 0
+    if len(overlap):
+        side[overlap], at[overlap] = np.where(right, 1.0, -1.0), 0
+        distance[overlap], along_edge[overlap] = separation[overlap], True
+    safe = np.where(along_edge, 1.0, distance) * np.where(rows.of_a.take(row), -1.0, 1.0)
+    n = np.stack([b * ex - to_left * ey, b * ey + to_left * ex]) / safe
+    if along_edge.any():
+        k = np.flatnonzero(along_edge)
+        n[:, k] = np.stack([ey[k], -ex[k]]) * (side[k] * safe[k])
+    return Closest(distance, n, row, side, at)
+
+
+def _joined(arrays: list[np.ndarray]) -> np.ndarray:
+    return arrays[0] if len(arrays) == 1 else np.concatenate(arrays)
+
+
+def _first_least(rows: Float[np.ndarray, "R N"]) -> Int[np.ndarray, "N"]:
+    """Return the numbers of the rows that have the least numbers; `argmin` is slow if there are few rows."""
+    if len(rows) > FEW_ROWS:
+        return rows.argmin(0)
+    least, found = rows[0], np.zeros(rows.shape[1], int)
+    for k in range(1, len(rows)):
+        found = np.where(rows[k] < least, k, found)
+        least = np.minimum(least, rows[k])
+    return found
+
+
+def _ways_out(sides: list[tuple[np.ndarray, np.ndarray]]) -> tuple[Int[np.ndarray, "N"], Bool[np.ndarray, "N"]]:
+    """Return the pairs of a corner and an edge of the shortest ways out, and whether they lead to the right of the edge.
+
+    Given are the places to the left of the edges, and the separations.
+    """
+    found, first = [], 0
+    for left, apart in sides:
+        corners, edges, count = left.shape
+        k, best = np.arange(count), apart.argmax(0)
+        deep = left[:, best, k]
+        right = (-deep.max(0) >= deep.min(0)) | (edges > 1)
+        corner = np.where(right, deep.argmax(0), deep.argmin(0))
+        found.append((apart[best, k], first + corner * edges + best, right))
+        first += corners * edges
+    (apart, row, right), (other_apart, other, other_right) = found[0], found[-1]
+    is_first = apart >= other_apart
+    return np.where(is_first, row, other), np.where(is_first, right, other_right)
 
 
 def gap_at(p: Any, start: Any, end: Any, side: Any, at: Any) -> tuple[Any, Any, Any]:

@@ -240,9 +240,11 @@ def gaps(
     contacts = [
         Touch(pair, *motion.value(np.array(ends)).tolist()) for pair, x in zip(checked_pairs, touches, strict=True) for ends in x
     ]
+    u, pieces = (np.array(x) for x in zip(*((x.u, x.piece) for x in least), strict=True))
+    values_found, poses = motion.value(u).tolist(), motion.at(u, pieces)[0][:, :-1]
     found = [
-        LeastGap(pair, float(motion.value(x.u)), d, x.bound, x.places, motion.at(np.array([x.u]), np.array([x.piece]))[0][0, :-1])
-        for pair, x, d in zip(checked_pairs, least, distances, strict=True)
+        LeastGap(pair, value, d, x.bound, x.places, q)
+        for pair, value, x, d, q in zip(checked_pairs, values_found, least, distances, poses, strict=True)
     ]
     order = np.argsort([x.distance for x in least], kind="stable")
     contacts.sort(key=lambda x: (x.begins, x.ceases))

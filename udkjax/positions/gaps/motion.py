@@ -30,45 +30,34 @@ class PolynomialMotion(NamedTuple):
     Attributes:
         u: the parameters at which its polynomials meet.
         points: their control points; NaN where nothing is known.
+        known: mask of the intervals with a polynomial: those of positive length with finite control points.
         unit: unit of its values.
         value: the value of the driver (rad, m) or the time (s) at parameters.
         toggles: whether the range ends at toggles.
     """
 
     u: Float[np.ndarray, "pieces+1"]
-    points: Float[np.ndarray, "degree+1 pieces bodies 3"]
+    points: Float[np.ndarray, "degree+1 3 bodies pieces"]
+    known: Bool[np.ndarray, "pieces"]
     unit: str
     value: Callable[[Any], Any] = np.asarray
     toggles: bool = False
 
-    @property
-    def known(self) -> Bool[np.ndarray, "pieces"]:
-        """Mask of the intervals with a polynomial: those of positive length with finite control points."""
-        return np.isfinite(self.points).all((0, 2, 3)) & (np.diff(self.u) > 0)
+    @classmethod
+    def of(cls, u: Float[np.ndarray, "n"], points: np.ndarray, unit: str) -> "PolynomialMotion":
+        """Return the motion with these control points."""
+        return cls(u, points, np.isfinite(points.reshape(-1, len(u) - 1).sum(0)) & (np.diff(u) > 0), unit)
 
     @property
     def missing(self) -> float:
         """Fraction of the range without polynomials."""
         return max(0.0, 1.0 - float(np.diff(self.u)[self.known].sum() / (self.u[-1] - self.u[0])))
 
-    @property
-    def nodes(self) -> Float[np.ndarray, "pieces+1 bodies 3"]:
-        """The poses at which polynomials meet."""
-        return np.concatenate([self.points[0], self.points[-1, -1:]])
-
-    def at(self, u: Any, piece: Int[np.ndarray, "n"], body: Any = slice(None)) -> tuple[np.ndarray, np.ndarray]:
-        """Return the poses of bodies in pieces, and their derivatives by u."""
+    def at(self, u: Any, piece: Int[np.ndarray, "n"]) -> tuple[np.ndarray, np.ndarray]:
+        """Return the poses (n, bodies, 3) in pieces, and their derivatives by u."""
         h = np.diff(self.u)[piece]
-        t, h = (x.reshape(-1, *[1] * (self.points[0, piece, body].ndim - 1)) for x in ((u - self.u[piece]) / h, h))
-        return de_casteljau(self.points[:, piece, body], t, h)
-
-    def largest_derivatives(self) -> Float[np.ndarray, "2 2 pieces bodies"]:
-        """Return bounds of speed and angular velocity, and of acceleration and angular acceleration, over each piece."""
-        h, found, stage = np.diff(self.u)[:, None, None], [], self.points
-        for _ in range(2):
-            stage = (len(stage) - 1) * np.diff(stage, axis=0) / h
-            found.append([np.hypot(stage[..., 0], stage[..., 1]).max(0), np.abs(stage[..., 2]).max(0)])
-        return np.array(found)
+        q, v = de_casteljau(self.points[..., piece], (u - self.u[piece]) / h, h)
+        return q.T, v.T
 
 
 def de_casteljau(stage: Any, t: Any, h: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -83,10 +72,11 @@ def de_casteljau(stage: Any, t: Any, h: Any) -> tuple[np.ndarray, np.ndarray]:
 def motion_of_run(run: StateHistory) -> PolynomialMotion:
     """Return the motion of a run: between output times, the cubics through positions and velocities."""
     ts, q, v = (np.asarray(x, float) for x in (run.ts, run.q, getattr(run, "slopes", run.v)))
-    q, v = (np.concatenate([x, 0.0 * x[:, :1]], 1) for x in (q, v))
-    third = np.diff(ts)[:, None, None] / 3
-    points = np.stack([q[:-1], q[:-1] + third * v[:-1], q[1:] - third * v[1:], q[1:]])
-    motion = PolynomialMotion(ts, points, getattr(run, "unit", "") or "s")
+    third, ends = np.diff(ts) / 3, np.empty((2, 3, q.shape[1] + 1, len(ts)))
+    ends[0, :, :-1], ends[1, :, :-1] = q.T, v.T
+    ends[:, :, -1] = 0.0 * ends[:, :, 0]  # the ground
+    (q0, v0), (q1, v1) = ends[..., :-1], ends[..., 1:]
+    motion = PolynomialMotion.of(ts, np.stack([q0, q0 + third * v0, q1 - third * v1, q1]), getattr(run, "unit", "") or "s")
     if not motion.known.any():
         raise ValueError("the run has no two states after each other, so that nothing moves between them")
     return motion
@@ -147,7 +137,7 @@ def _follow(
     for turn in range(MOST_HALVINGS + 1):
         if toggles is not None:
             x[0], x[-1] = _toggle(u[1] - u[0], x[1], toggles[0]), _toggle(u[-2] - u[-1], x[-2], toggles[1])
-        motion = PolynomialMotion(u, _control_points(np.diff(u)[:, None, None], x[:-1], x[1:]), unit)
+        motion = PolynomialMotion.of(u, _control_points(np.diff(u), x[:-1], x[1:]), unit)
         check = check[motion.known[check]]
         if turn == MOST_HALVINGS or not len(check):
             break
@@ -162,9 +152,9 @@ def _follow(
     return motion
 
 
-def _control_points(h: Any, one: PosesAndRates, other: PosesAndRates) -> Float[np.ndarray, "6 pieces bodies 3"]:
+def _control_points(h: Any, one: PosesAndRates, other: PosesAndRates) -> Float[np.ndarray, "6 3 bodies pieces"]:
     """Return the control points of polynomials of degree five by positions and two derivatives at both ends."""
-    (q0, v0, a0), (q1, v1, a1) = np.moveaxis(one, 1, 0), np.moveaxis(other, 1, 0)
+    (q0, v0, a0), (q1, v1, a1) = (x.transpose(1, 3, 2, 0) for x in (one, other))
     b1, b4 = q0 + h * v0 / 5, q1 - h * v1 / 5
     return np.stack([q0, b1, 2 * b1 - q0 + h * h * a0 / 20, 2 * b4 - q1 + h * h * a1 / 20, b4, q1])
 

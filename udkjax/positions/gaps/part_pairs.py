@@ -1,23 +1,60 @@
 """Pairs of convex parts of links in poses: their gaps, where they are closest, and how fast the gaps change."""
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from udkjax.positions.gaps.convex import Feature, feature, gap_at, signed_distance
+from udkjax.positions.gaps.convex import Closest, Corners, Feature, closest
 from udkjax.positions.gaps.shapes import ConvexPart
 
 
-class Closest(NamedTuple):
-    """The closest features of parts, directions from A to B (2, n), places (2, 2, n), rates of gaps, and corners."""
+class PlacedFrames(NamedTuple):
+    """The frames of bodies (n): their origins, and the cosines and sines of their angles."""
 
+    x: np.ndarray
+    y: np.ndarray
+    cos: np.ndarray
+    sin: np.ndarray
+
+    @classmethod
+    def of(cls, q: Float[np.ndarray, "3 n"]) -> "PlacedFrames":
+        """Return the frames of poses."""
+        return cls(q[0], q[1], np.cos(q[2]), np.sin(q[2]))
+
+    def take(self, k: Int[np.ndarray, "n"]) -> "PlacedFrames":
+        """Return the frames k."""
+        return PlacedFrames(*(x.take(k) for x in self))
+
+    def place(self, corners: Corners) -> Corners:
+        """Return corners that are given in the frames."""
+        a, b = corners[:, 0], corners[:, 1]
+        placed = np.empty_like(corners)
+        np.subtract(self.cos * a, self.sin * b, out=placed[:, 0])
+        np.add(self.sin * a, self.cos * b, out=placed[:, 1])
+        placed[:, 0] += self.x
+        placed[:, 1] += self.y
+        return placed
+
+
+class ClosestPlaces(NamedTuple):
+    """Gaps of parts (n), their closest features and places (2, 2, n), directions n from A to B (2, n), and rates of gaps (n)."""
+
+    gap: np.ndarray
     features: Feature
-    n: np.ndarray
     places: np.ndarray
+    n: np.ndarray
     rate: np.ndarray
-    placed: list[np.ndarray]
+
+    @property
+    def arrays(self) -> list[np.ndarray]:
+        """All of its arrays, those of features as well."""
+        return [self.gap, *self.features, self.places, self.n, self.rate]
+
+    def take(self, k: slice) -> "ClosestPlaces":
+        """Return the closest places of the cases k."""
+        return ClosestPlaces(self.gap[k], self.features.take(k), self.places[..., k], self.n[:, k], self.rate[k])
 
 
 class PartPairs(NamedTuple):
@@ -44,60 +81,56 @@ class PartPairs(NamedTuple):
         """The sum of both radii of each pair (m)."""
         return self.radii[0] + self.radii[1]
 
-    def take(self, k: Any) -> "PartPairs":
-        """Return the pairs with the indices k."""
-        return PartPairs(*(x.take(k, -1) for x in self))  # contiguous along the pairs, unlike x[..., k]
+    @property
+    def counts(self) -> tuple[int, int]:
+        """The numbers of corners of the first ones and of the second ones."""
+        return len(self.A), len(self.B)
 
     @property
     def reach(self) -> Float[np.ndarray, "2 n"]:
         """The largest distances of corners from the origins of their bodies."""
-        return np.stack([np.hypot(x[:, 0], x[:, 1]).max(0) for x in (self.A, self.B)])
+        return np.stack([np.sqrt((x * x).sum(1).max(0)) for x in (self.A, self.B)])
 
-    def placed(self, q: Sequence[Float[np.ndarray, "3 n"]]) -> list[np.ndarray]:
-        """Return the corners in poses of the bodies."""
-        found = []
-        for corners, (x, y, angle) in zip((self.A, self.B), q, strict=True):
-            cos, sin = np.cos(angle), np.sin(angle)
-            a, b = corners[:, 0], corners[:, 1]
-            found.append(np.stack([x + cos * a - sin * b, y + sin * a + cos * b], 1))
-        return found
+    def placed(self, k: Int[np.ndarray, "n"], frames: Sequence[PlacedFrames]) -> tuple[Corners, Corners]:
+        """Return the corners of the pairs k in the frames of both bodies."""
+        return frames[0].place(self.A.take(k, -1)), frames[1].place(self.B.take(k, -1))
 
-    def gaps(self, q: Sequence[Float[np.ndarray, "3 n"]]) -> Float[np.ndarray, "n"]:
-        """Return the gaps in poses of the bodies."""
-        return signed_distance(*self.placed(q)) - self.radius
+    def closest(self, k: Int[np.ndarray, "n"], frames: Sequence[PlacedFrames]) -> tuple[tuple[Corners, Corners], Closest]:
+        """Return the corners of the pairs k in the frames of both bodies, and how they are closest: without the radii."""
+        corners = self.placed(k, frames)
+        return corners, closest(*corners)
 
-    def closest(self, poses: Sequence[tuple[np.ndarray, np.ndarray]]) -> Closest:
-        """Return the closest places of the pairs in poses (3, n) of the bodies, given with their rates."""
-        A, B = placed = self.placed([q for q, _ in poses])
-        found, every = feature(A, B), np.arange(len(self.owner))
-        corner, start, end = (
-            np.where(found.of_a, x[of_a % len(x), :, every].T, y[of_b % len(y), :, every].T)
-            for x, of_a, y, of_b in (
-                (A, found.corner, B, found.corner), (B, found.start, A, found.start), (B, found.end, A, found.end)
-            )
-        )  # fmt: skip
-        _, n, place = gap_at(corner, start, end, found.side, found.at)
-        n = np.where(found.of_a, -n, n)
-        places = np.where(found.of_a, [corner, place], [place, corner])
-        rates = []
-        for (q, v), here in zip(poses, places, strict=True):
-            arm = here - q[:2]
-            rates.append((n * (v[:2] + v[2] * np.stack([-arm[1], arm[0]]))).sum(0))
-        return Closest(found, n, places, rates[1] - rates[0], placed)
+    def closest_places(self, k: Int[np.ndarray, "n"], poses: Sequence[tuple[np.ndarray, np.ndarray]]) -> ClosestPlaces:
+        """Return the closest places of the pairs k in poses (3, n) of both bodies, given with their rates."""
+        corners, near = self.closest(k, [PlacedFrames.of(q) for q, _ in poses])
+        found, every = near.features(self.counts, slice(None)), np.arange(len(k))
+        places = np.empty((2, 2, len(k)))
+        for own, other, x, mask, way in ((0, 1, corners[0], found.of_a, near.n), (1, 0, corners[1], ~found.of_a, -near.n)):
+            i = np.flatnonzero(mask)
+            places[own][:, i] = place = x[found.corner[i], :, every[i]].T
+            places[other][:, i] = place + near.distance[i] * way[:, i]
+        rates = [
+            near.n[0] * (v[0] - v[2] * (here[1] - q[1])) + near.n[1] * (v[1] + v[2] * (here[0] - q[0]))
+            for (q, v), here in zip(poses, places, strict=True)
+        ]
+        return ClosestPlaces(near.distance - self.radius[k], found, places, near.n, rates[1] - rates[0])
 
 
 def part_pairs(parts: Sequence[ConvexPart], order: Sequence[str], pairs: Sequence[tuple[str, str]]) -> list[PartPairs]:
     """Return the pairs of parts of pairs of links, one group for each two numbers of corners."""
     groups: dict[tuple[int, int], list[tuple[int, int, int]]] = {}
-    corners = [np.asarray(part.corners, float) for part in parts]
-    for owner, pair in enumerate(pairs):
-        one, other = ([k for k, part in enumerate(parts) if part.body == name] for name in pair)
-        for i, j in ((i, j) for i in one for j in other):
-            groups.setdefault((len(corners[i]), len(corners[j])), []).append((owner, i, j))
+    corners, of_body = [np.asarray(part.corners, float) for part in parts], {}
+    for k, part in enumerate(parts):
+        of_body.setdefault(part.body, []).append(k)
+    for owner, (one, other) in enumerate(pairs):
+        for i in of_body[one]:
+            for j in of_body[other]:
+                groups.setdefault((len(corners[i]), len(corners[j])), []).append((owner, i, j))
     found, body = [], np.array([order.index(part.body) for part in parts])
     radius = np.array([float(part.radius) for part in parts])
-    for members in groups.values():
+    for (one, other), members in groups.items():
         owner, *both = np.array(members).T
-        A, B = (np.stack([corners[k] for k in x], -1) for x in both)
+        shapes = {n: np.stack([x if len(x) == n else np.zeros((n, 2)) for x in corners], -1) for n in {one, other}}
+        A, B = (shapes[n].take(x, -1) for n, x in zip((one, other), both, strict=True))
         found.append(PartPairs(owner, np.array(both), body[np.array(both)], A, B, radius[np.array(both)]))
     return found

@@ -2,7 +2,8 @@
 
 With L the length of the ways of both parts over an interval, d >= (d0 + d1 - L) / 2. With n the direction in which the gap at one
 end is measured, d >= min n.(b - a) over all points of the parts, of which each is above its chord minus M h^2 / 8, with M the
-sum of the largest accelerations. Intervals in which a gap could be below the least one found are split.
+sum of the largest accelerations. Within a polynomial of the motion, `bounds` has narrower ones. Intervals in which a gap could be
+below the least one found are split.
 """
 
 from collections.abc import Callable, Sequence
@@ -10,19 +11,24 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.optimize.elementwise import find_root
 
-from udkjax.positions.gaps.convex import Feature
-from udkjax.positions.gaps.motion import PolynomialMotion, de_casteljau
-from udkjax.positions.gaps.part_pairs import Closest, PartPairs, part_pairs
+from udkjax.arrays import ROUNDING
+from udkjax.positions.gaps.bounds import Moving, MovingPart, bounds_by_features
+from udkjax.positions.gaps.convex import Closest, Corners, Feature
+from udkjax.positions.gaps.motion import PolynomialMotion
+from udkjax.positions.gaps.motion_tables import MotionTables
+from udkjax.positions.gaps.part_pairs import ClosestPlaces, PartPairs, PlacedFrames, part_pairs
 from udkjax.positions.gaps.shapes import ConvexPart
 
 PROVEN = 1e-10  # of the size of the mechanism: how far below the least gap found another one might be
 OPENED = 1e-6  # of the size: smaller openings within a stretch of contact may be passed over
-BLOCK = 16  # polynomials of a motion in the first intervals
-SPLITS = 4  # parts into which an interval within a polynomial is split
+SPLITS = 4  # parts into which an interval is split
+BLOCK = SPLITS**2  # polynomials of a motion in the first intervals
 MOST_INTERVALS = 100_000  # at a time; beyond that, the bound that is proven is returned
-BESIDE = 1e-6  # of the interval around a least gap: where both sides of a kink are seen
+POINTS = 1024  # at a time: their arrays stay in the processor's cache
+BESIDE = 1e-6  # of a piece, from a least gap: where both sides of a kink are seen
+MOST_STEPS = 100  # to a root
+LAST_STEP = 1e-12  # to it, of a piece
 Stretches = list[tuple[float, float]]
 
 
@@ -53,7 +59,8 @@ def search(
         pairs: the pairs of links.
         motion: the motion.
     """
-    searches = [PairSearch(group, motion) for group in part_pairs(parts, order, pairs)]
+    tables = MotionTables(motion)
+    searches = [PairSearch(group, tables) for group in part_pairs(parts, order, pairs)]
     least, low = np.full((2, len(pairs)), np.inf)
     found: dict[int, Least] = {}
     touches: list[Stretches] = [[] for _ in pairs]
@@ -68,188 +75,257 @@ def search(
     return [found[k] for k in range(len(pairs))], [_joined(x) for x in touches]
 
 
+class Intervals(NamedTuple):
+    """Intervals of pairs k from places s0 to s1, with the gaps there, and lower bounds of those between."""
+
+    k: Int[np.ndarray, "n"]
+    s0: Float[np.ndarray, "n"]
+    s1: Float[np.ndarray, "n"]
+    d0: Float[np.ndarray, "n"]
+    d1: Float[np.ndarray, "n"]
+    low: Float[np.ndarray, "n"]
+
+    @classmethod
+    def joined(cls, intervals: "Sequence[Intervals]") -> "Intervals":
+        """Return all of several."""
+        return cls(*(np.concatenate(x) for x in zip(*intervals, strict=True)))
+
+
 class PairSearch:
     """The gaps of pairs of parts of the same numbers of corners along a motion."""
 
-    def __init__(self, pairs: PartPairs, motion: PolynomialMotion):
-        self.pairs, self.motion, self.nodes, self.steps = pairs, motion, motion.nodes, np.diff(motion.u)
-        self.controls = motion.points.reshape(len(motion.points), -1, 3)  # of piece p and body b in row p * bodies + b
-        known, count, h = motion.known, len(pairs.owner), self.steps
-        places = self.nodes[:, np.unique(pairs.bodies), :2][np.append(known, False) | np.append(False, known)]
-        self.size = float(np.ptp(places, axis=(0, 1)).max()) + float(pairs.reach.max()) + float(pairs.radius.max())
-        speeds, accelerations = motion.largest_derivatives()
-        ways = np.where(known[:, None], h[:, None] * speeds, 0.0)
-        self.ways = np.concatenate([np.zeros_like(ways[:, :1]), np.cumsum(ways, 1)], 1)
-        self.bends = accelerations[0], accelerations[1] + speeds[1] ** 2
-        self.starts = np.flatnonzero(known & ~np.append(False, known[:-1]))
-        self.ends = np.flatnonzero(known & ~np.append(known[1:], False)) + 1
-        self.reach, (self.least, self.low) = pairs.reach, np.full((2, count), np.inf)
-        self.u, self.piece, self.step = np.zeros(count), np.zeros(count, int), np.zeros(count)
-        self.crossings: list[np.ndarray] = []  # pairs, pieces, ends u, gaps there
+    def __init__(self, pairs: PartPairs, motion: MotionTables):
+        self.pairs, self.motion, self.reach, self.radius = pairs, motion, pairs.reach, pairs.radius
+        bodies, count = np.unique(pairs.bodies), len(pairs.owner)
+        extent = (motion.highest[:, bodies].max(1) - motion.lowest[:, bodies].min(1)).max()
+        self.size = float(extent) + float(self.reach.max()) + float(self.radius.max())
+        self.rounding = ROUNDING * self.size
+        self.least, self.low = np.full((2, count), np.inf)
+        self.s, self.step = np.zeros((2, count))
+        self.crossings: list[np.ndarray] = []  # pairs, places s0 and s1, gaps there
+        self.touching_at_ends: list[np.ndarray] = []  # pairs that touch at the starts and at the ends of chains (pairs, chains)
 
-    def gaps(self, k: np.ndarray, piece: np.ndarray, u: np.ndarray) -> Float[np.ndarray, "n"]:
-        """Return the gaps (m) of the pairs k at parameters u of pieces of the motion."""
-        pairs = self.pairs.take(k)
-        return pairs.gaps([pose for pose, _ in self._poses(pairs, piece, u)])
+    def closest_places(self, k: np.ndarray, s: np.ndarray) -> ClosestPlaces:
+        """Return the closest places of pairs k at places s of the motion."""
+        return self.pairs.closest_places(k, [self.motion.poses(bodies[k], s) for bodies in self.pairs.bodies])
 
-    def closest(self, k: np.ndarray, piece: np.ndarray, u: np.ndarray) -> Closest:
-        """Return the closest places of pairs k at parameters."""
-        pairs = self.pairs.take(k)
-        return pairs.closest(self._poses(pairs, piece, u))
+    def _gaps(self, k: np.ndarray, s: np.ndarray) -> Float[np.ndarray, "n"]:
+        return self.pairs.closest(k, self._frames(k, s))[1].distance - self.radius[k]
 
-    def _poses(self, pairs: PartPairs, piece: np.ndarray, u: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return the poses (3, n) of both bodies of pairs, and their derivatives by u; contiguous, as arithmetic is fastest."""
-        h = self.steps[piece]
-        t, (degree, count) = (u - self.motion.u[piece]) / h, (len(self.controls), self.nodes.shape[1])
-        rows = (self.controls.take(piece * count + body, 1) for body in pairs.bodies)
-        return [de_casteljau(np.ascontiguousarray(x.reshape(degree, -1, 3).swapaxes(1, 2)), t, h) for x in rows]
+    def _frames(self, k: np.ndarray, s: np.ndarray) -> list[PlacedFrames]:
+        return [PlacedFrames.of(self.motion.poses(bodies[k], s)[0]) for bodies in self.pairs.bodies]
 
     def run(self, least: Float[np.ndarray, "owners"]) -> None:
         """Split intervals until no gap can be below the least found, which is updated, and no touch is hidden within one."""
-        k, piece, u, d = self._between_poses(least)
-        while len(k):
-            low, high = self._bounds(k, piece, u, d)
-            split = self._is_open(k, low, high, d, least)
-            if split.sum() > MOST_INTERVALS:
-                split[:] = False
-            self._finish(k[~split], piece[~split], u[~split], d[~split], low[~split])
-            k, piece, u, d = self._split(k[split], piece[split], u[split], d[split], least)
+        left, step = self._first_intervals(least), float(BLOCK)
+        while 0 < len(left.k) <= MOST_INTERVALS:
+            step /= SPLITS
+            rows, found = POINTS // (SPLITS + 1), []
+            for first in range(0, len(left.k), rows):
+                k, s0, s1 = (x[first : first + rows, None] for x in left[:3])
+                s = np.minimum(s0 + step * np.arange(SPLITS + 1), s1).ravel()
+                k = np.broadcast_to(k, (len(k), SPLITS + 1)).ravel()
+                kept = np.append(True, (s[1:] != s[:-1]) | (k[1:] != k[:-1]))
+                inside = (np.arange(len(k)) % (SPLITS + 1) > 0)[kept][1:]
+                k, s = k[kept], s[kept]
+                found.append(self._open(k, s, self._frames(k, s), inside, step, least)[0])
+            left = Intervals.joined(found)
+        self._finish(left)
 
-    def _between_poses(self, least: Float[np.ndarray, "owners"]) -> tuple[np.ndarray, ...]:
-        """Return the pairs, pieces, parameters and gaps at the ends of pieces that the bound by ways does not exclude."""
-        ends = [range(start, end, BLOCK) for start, end in zip(self.starts, self.ends, strict=True)]
-        i, j = np.array([(x, min(x + BLOCK, e)) for xs, e in zip(ends, self.ends, strict=True) for x in xs]).T
-        k = np.repeat(np.arange(len(self.least)), len(i))
-        i, j, u, found = np.tile(i, len(self.least)), np.tile(j, len(self.least)), self.motion.u, []
-        d = np.stack([self._at_nodes(k, x) for x in (i, j)], 1)
-        for x, piece, column in ((i, i, 0), (j, j - 1, 1)):
-            self._note(k, piece, u[x], d[:, column], u[j] - u[i], least)
-        while len(k):
-            way = 0.5 * self._way(k, i, j)
-            low, high = d.mean(1) - way, d.mean(1) + way
-            is_open, is_single = self._is_open(k, low, high, d, least), j - i == 1
-            found.append([x[is_open & is_single] for x in (k, i, np.stack([u[i], u[j]], 1), d)])
-            self._finish(*(x[~is_open] for x in (k, i, np.stack([u[i], u[j]], 1), d, low)))
-            k, i, j, d = (x[is_open & ~is_single] for x in (k, i, j, d))
-            middle = (i + j) // 2
-            between = self._at_nodes(k, middle)
-            self._note(k, middle, u[middle], between, u[j] - u[i], least)
-            k, i, j = np.tile(k, 2), np.append(i, middle), np.append(middle, j)
-            d = np.stack([np.append(d[:, 0], between), np.append(between, d[:, 1])], 1)
-        return tuple(np.concatenate(x) for x in zip(*found, strict=True))
+    def _first_intervals(self, least: Float[np.ndarray, "owners"]) -> Intervals:
+        """Return the blocks of pieces in which gaps can be below the least found."""
+        motion, count = self.motion, len(self.least)
+        blocks = [np.append(np.arange(*ends, BLOCK), ends[1]) for ends in zip(motion.starts, motion.ends, strict=True)]
+        s, last = np.concatenate(blocks).astype(float), np.cumsum([len(x) for x in blocks]) - 1
+        first, inside = np.append(0, last[:-1] + 1), np.ones(len(s), bool)
+        inside[last] = False
+        bodies, rows = np.unique(self.pairs.bodies, return_inverse=True)
+        frames = PlacedFrames.of(motion.poses(np.repeat(bodies, len(s)), np.tile(s, len(bodies)))[0])
+        rows, found, touching = rows.reshape(2, -1), [], []
+        size = max(1, POINTS // len(s))
+        for start in range(0, count, size):
+            some = np.arange(start, min(start + size, count))
+            at = ((rows[:, some] * len(s))[..., None] + np.arange(len(s))).reshape(2, -1)
+            k, places, within = np.repeat(some, len(s)), np.tile(s, len(some)), np.tile(inside, len(some))[:-1]
+            intervals, gaps = self._open(k, places, [frames.take(x) for x in at], within, float(BLOCK), least)
+            found.append(intervals)
+            touching.append(gaps.reshape(-1, len(s)) < 0)
+        self.touching_at_ends = [np.concatenate([x[:, ends] for x in touching]) for ends in (first, last)]
+        return Intervals.joined(found)
 
-    def _at_nodes(self, k: np.ndarray, node: np.ndarray) -> np.ndarray:
-        pairs = self.pairs.take(k)
-        return pairs.gaps([np.ascontiguousarray(self.nodes[node, body].T) for body in pairs.bodies])
+    def _open(
+        self, k: np.ndarray, s: np.ndarray, frames: list[PlacedFrames], inside: np.ndarray, step: float, least: np.ndarray
+    ) -> tuple[Intervals, Float[np.ndarray, "n"]]:
+        """Return the intervals between neighbouring places of a pair that must be split, and the gaps at all places.
 
-    def _way(self, k: np.ndarray, i: np.ndarray, j: np.ndarray) -> np.ndarray:
-        """Return the sum (m) of the lengths of the paths of both parts of pairs k, from node i to node j."""
-        line, turn = self.ways[:, j, self.pairs.bodies[:, k]] - self.ways[:, i, self.pairs.bodies[:, k]]
-        return (line + turn * self.reach[:, k]).sum(0)
+        Args:
+            k: pairs, in order.
+            s: places.
+            frames: frames of both bodies there.
+            inside: whether an interval is between each place and the next one.
+            step: the largest length of the intervals.
+            least: the least gaps of pairs of links, which are updated.
+        """
+        corners, near = self.pairs.closest(k, frames)
+        radius = self.radius[k]
+        d = near.distance - radius
+        self._note(k, s, d, step, least)
+        low, high = self._bounds(k, s, d, corners, near.n, radius, step)
+        is_open = self._is_open(k[:-1], low, high, d[:-1], d[1:], least) & inside
+        if step <= 1 and len(i := np.flatnonzero(is_open)):
+            bound, at = self._bounds_by_features(k[i], s, i, corners, near)
+            low[i], between = np.fmax(low[i], bound - radius[i]), s[i] + at * (s[i + 1] - s[i])
+            self._note(k[i], between, self._gaps(k[i], between), step, least)
+            is_open[i] = self._is_open(k[i], low[i], high[i], d[i], d[i + 1], least)
+        is_closed = inside & ~is_open
+        intervals = k[:-1], s[:-1], s[1:], d[:-1], d[1:], low
+        self._finish(Intervals(*(x[is_closed] for x in intervals)))
+        return Intervals(*(x[is_open] for x in intervals)), d
+
+    def _finish(self, found: Intervals) -> None:
+        np.minimum.at(self.low, found.k, found.low)
+        crosses = (found.d0 < 0) != (found.d1 < 0)
+        if crosses.any():
+            self.crossings.append(np.stack([x[crosses] for x in found[:5]]))
+
+    def _bounds(
+        self, k: np.ndarray, s: np.ndarray, d: np.ndarray, corners: tuple[Corners, Corners], n: np.ndarray, radius: np.ndarray,
+        step: float,
+    ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+        """Return bounds of gaps between neighbouring places, below and above, by lengths of ways and directions at the ends."""
+        u = self.motion.parameters(s)
+        h, piece, (speed, acceleration) = u[1:] - u[:-1], self.motion.piece_at[s[:-1].astype(int)], np.zeros((2, len(k) - 1))
+        largest, k = self.motion.over(max(1, int(step))), k[:-1]
+        for bodies, reach in zip(self.pairs.bodies, self.reach, strict=True):
+            (v, a), (w, c) = largest.take(bodies[k] * self.motion.pieces + piece, -1)
+            speed += v + reach[k] * w
+            acceleration += a + reach[k] * c
+        A, B = corners
+        to_end = (n[:, :-1] * B[..., 1:]).sum(1).min(0) - (n[:, :-1] * A[..., 1:]).sum(1).max(0) - radius[1:]
+        to_start = (n[:, 1:] * B[..., :-1]).sum(1).min(0) - (n[:, 1:] * A[..., :-1]).sum(1).max(0) - radius[1:]
+        chord = np.maximum(np.minimum(d[:-1], to_end), np.minimum(d[1:], to_start)) - acceleration * h**2 / 8
+        mean, way = 0.5 * (d[:-1] + d[1:]), 0.5 * speed * h
+        return np.maximum(mean - way, chord), mean + way
+
+    def _bounds_by_features(
+        self, k: np.ndarray, s: np.ndarray, i: np.ndarray, corners: tuple[Corners, Corners], near: Closest
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return bounds of distances from the places i to the next ones, as the closest features turn, and where they are."""
+        ends, u = np.stack([i, i + 1]), self.motion.parameters(s)
+        piece, parts = s[i].astype(int), []
+        for bodies, places, reach in zip(self.pairs.bodies, corners, self.reach, strict=True):
+            body = bodies[k]
+            q, v = (x.reshape(3, 2, -1) for x in self.motion.poses(np.tile(body, 2), s[ends].ravel()))
+            at, row = places.take(ends, -1), body * self.motion.pieces + piece
+            rate = v[:2] + v[2] * np.stack([q[1] - at[:, 1], at[:, 0] - q[0]], 1)
+            directions = np.concatenate([np.ones((1, len(k))), self.motion.directions.take(row, -1)])
+            parts.append(MovingPart(Moving(at, rate), q[:2], v[2], reach[k], self.motion.places.take(row, -1), directions))
+        return bounds_by_features(parts[0], parts[1], near.features(self.pairs.counts, ends), u[i + 1] - u[i])
 
     def _is_open(
-        self, k: np.ndarray, low: np.ndarray, high: np.ndarray, d: np.ndarray, least: np.ndarray
+        self, k: np.ndarray, low: np.ndarray, high: np.ndarray, d0: np.ndarray, d1: np.ndarray, least: np.ndarray
     ) -> Bool[np.ndarray, "n"]:
         """Return True for intervals in which a gap may be below the least one, or may change its sign unseen."""
-        slack = PROVEN * self.size
-        hides = ((low < -slack) & (d > 0).all(1)) | ((high > OPENED * self.size) & (d < 0).all(1))
-        crosses = ((d[:, 0] < 0) != (d[:, 1] < 0)) & (high - low > OPENED * self.size)
+        slack, opened = PROVEN * self.size, OPENED * self.size
+        hides = ((low < -slack) & (np.minimum(d0, d1) > 0)) | ((high > opened) & (np.maximum(d0, d1) < 0))
+        crosses = ((d0 < 0) != (d1 < 0)) & (high - low > opened)
         return (low < least[self.pairs.owner[k]] - slack) | hides | crosses
 
-    def _finish(self, k: np.ndarray, piece: np.ndarray, u: np.ndarray, d: np.ndarray, low: np.ndarray) -> None:
-        np.minimum.at(self.low, k, low)
-        crosses = (d[:, 0] < 0) != (d[:, 1] < 0)
-        if crosses.any():
-            self.crossings.append(np.column_stack([k, piece, u, d])[crosses])
-
-    def _note(self, k: np.ndarray, piece: np.ndarray, u: np.ndarray, d: np.ndarray, step: np.ndarray, least: np.ndarray) -> None:
-        """Keep the least gaps so far, with their parameters and the length of the intervals around them."""
-        order = np.lexsort((d, k))
-        first = order[np.append(True, np.diff(k[order]) > 0)[: len(k)]]
-        better = first[d[first] < self.least[k[first]]]
-        for kept, new in ((self.least, d), (self.u, u), (self.piece, piece), (self.step, step)):
-            kept[k[better]] = new[better]
-        np.minimum.at(least, self.pairs.owner[k[better]], d[better])
-
-    def _bounds(self, k: np.ndarray, piece: np.ndarray, u: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return bounds of the gaps of pairs k over intervals within pieces, below and above."""
-        h, bodies = u[:, 1] - u[:, 0], self.pairs.bodies[:, k]
-        way = 0.5 * self._way(k, piece, piece + 1) * h / np.diff(self.motion.u)[piece]
-        line, turn = (x[piece, bodies] for x in self.bends)
-        sag = (line + turn * self.reach[:, k]).sum(0) * h**2 / 8
-        here = self.closest(np.tile(k, 2), np.tile(piece, 2), u.T.ravel())  # at the starts, then at the ends
-        A, B = ((here.n * np.roll(x, len(k), -1)).sum(1) for x in here.placed)  # places at one end, along n of the other one
-        chords = np.minimum(d.T, (B.min(0) - A.max(0)).reshape(2, -1) - self.pairs.radius[k])
-        return np.maximum(d.mean(1) - way, chords.max(0) - sag), d.mean(1) + way
-
-    def _split(self, k: np.ndarray, piece: np.ndarray, u: np.ndarray, d: np.ndarray, least: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Return the parts of intervals, with their gaps."""
-        steps = u[:, :1] + (u[:, 1:] - u[:, :1]) * np.arange(SPLITS + 1) / SPLITS
-        steps[:, -1] = u[:, 1]
-        inner = steps[:, 1:-1].ravel()
-        ks, pieces = np.repeat(k, SPLITS - 1), np.repeat(piece, SPLITS - 1)
-        inside = self.gaps(ks, pieces, inner)
-        self._note(ks, pieces, inner, inside, np.repeat(steps[:, 1] - steps[:, 0], SPLITS - 1), least)
-        gaps = np.concatenate([d[:, :1], inside.reshape(-1, SPLITS - 1), d[:, 1:]], 1)
-        ends = (np.stack([x[:, :-1].ravel(), x[:, 1:].ravel()], 1) for x in (steps, gaps))
-        return np.repeat(k, SPLITS), np.repeat(piece, SPLITS), *ends
+    def _note(self, k: np.ndarray, s: np.ndarray, d: np.ndarray, step: float, least: np.ndarray) -> None:
+        """Keep the least gaps so far, the first of equal ones, with their places and the length of the intervals around them."""
+        begins = np.flatnonzero(np.append(True, k[1:] != k[:-1]))
+        equal = np.minimum.reduceat(d, begins) + self.rounding
+        at = np.flatnonzero(d <= np.repeat(equal, np.diff(np.append(begins, len(k)))))
+        at = at[np.append(True, k[at[1:]] != k[at[:-1]])]
+        kept = self.least[k[at]]
+        at = at[(d[at] < kept - self.rounding) | ((d[at] <= kept + self.rounding) & (s[at] < self.s[k[at]]))]
+        pair = k[at]
+        self.least[pair], self.s[pair], self.step[pair] = np.minimum(self.least[pair], d[at]), s[at], step
+        np.minimum.at(least, self.pairs.owner[pair], d[at])
 
     def found(self, k: Int[np.ndarray, "n"], low_of: Float[np.ndarray, "owners"]) -> list[Least]:
         """Return the least gaps of pairs of parts k, where they cease to fall or at an end, with bounds of pairs of links."""
-        m, u, step = self.motion, self.u[k], self.step[k]
-        every, chain = np.arange(len(k)), np.searchsorted(self.starts, self.piece[k], side="right") - 1
-        first, last = self.starts[chain], self.ends[chain] - 1
+        motion, s, step = self.motion, self.s[k], self.step[k]
+        chain = np.searchsorted(motion.starts, s, side="right") - 1
+        first, last = motion.starts[chain], motion.ends[chain]
+        bracket = low, high = np.maximum(first, s - step), np.minimum(last, s + step)
+        ends = self.closest_places(np.tile(k, 2), np.concatenate(bracket))
+        slopes, root = ends.rate.reshape(2, -1), s.copy()
+        inner = np.flatnonzero((slopes[0] < 0) & (slopes[1] > 0))
+        root[inner] = _roots(lambda x, i: self.closest_places(k[inner[i]], x).rate, *(x[inner] for x in (low, high, *slopes, s)))
 
-        def at(u: np.ndarray, some: Any = slice(None)) -> tuple[np.ndarray, ...]:
-            pieces = np.searchsorted(m.u, u, side="right") - 1
-            return k[some], np.clip(pieces, first[some], last[some]), u
+        def around(i: np.ndarray, s: np.ndarray) -> list[ClosestPlaces]:
+            places = np.maximum(s - BESIDE, low[i]), s, np.minimum(s + BESIDE, high[i])
+            at = self.closest_places(np.tile(k[i], 3), np.concatenate(places))
+            return [at.take(slice(n * len(i), (n + 1) * len(i))) for n in range(3)]
 
-        ends = low, high = np.maximum(m.u[first], u - step), np.minimum(m.u[last + 1], u + step)
-        slopes = self.closest(*at(np.concatenate(ends), np.tile(every, 2))).rate.reshape(2, -1)
-        root, inner = u.copy(), np.flatnonzero((slopes[0] < 0) & (slopes[1] > 0))
-        root[inner] = _roots(lambda x, some: self.closest(*at(x, some)).rate, low[inner], high[inner], inner)
-        places = np.stack([root, low, high, u])
-        u = places[np.argmin(self.gaps(*at(places.ravel(), np.tile(every, 4))).reshape(4, -1), 0), every]
-        distances, here = self.gaps(*at(u)), self.closest(*at(u))
-        fixed = ((u <= m.u[first]) & (slopes[0] > 0)) | ((u >= m.u[last + 1]) & (slopes[1] < 0))
-        sides = [self.closest(*at(np.clip(u + side * BESIDE * step, low, high))) for side in (-1, 1)]
-        kink = (sides[0].rate < -(BESIDE**0.5) * np.abs(slopes[0])) & (sides[1].rate > BESIDE**0.5 * np.abs(slopes[1])) & ~fixed
-        ends = here.places + np.array([[[1.0]], [[-1.0]]]) * self.pairs.radii[:, None, k] * here.n
-        found = []
-        for n, pair in enumerate(k.tolist()):
-            features = [x.features.take(n) for x in (sides if kink[n] else [here])]
-            owner, parts = int(self.pairs.owner[pair]), self.pairs.parts[:, pair]
-            bound = min(float(distances[n]), float(low_of[owner]))
-            found.append(
-                Least(
-                    float(u[n]), int(at(u)[1][n]), float(distances[n]), bound, (int(parts[0]), int(parts[1])),
-                    ends[:, :, n], tuple(features), bool(fixed[n]),
-                )
-            )  # fmt: skip
-        return found
+        sides = around(np.arange(len(k)), root)
+        gaps = np.stack([sides[1].gap - self.rounding, *ends.gap.reshape(2, -1), self.least[k]])
+        best = gaps.argmin(0)
+        other = np.flatnonzero(best > 0)
+        if len(other):
+            places = np.stack([root, low, high, s])[best, np.arange(len(k))]
+            for kept, new in zip(sides, around(other, places[other]), strict=True):
+                for x, y in zip(kept.arrays, new.arrays, strict=True):
+                    x[..., other] = y
+            root = places
+        before, here, after = sides
+        fixed = ((root <= first) & (slopes[0] > 0)) | ((root >= last) & (slopes[1] < 0))
+        steep = BESIDE**0.5 * np.abs(slopes)
+        kink = (before.rate < -steep[0]) & (after.rate > steep[1]) & ~fixed
+        places = here.places + np.array([[[1.0]], [[-1.0]]]) * self.pairs.radii[:, None, k] * here.n
+        bounds = np.minimum(here.gap, low_of[self.pairs.owner[k]])
+        features = [list(map(Feature._make, zip(*(y.tolist() for y in x.features), strict=True))) for x in (before, here, after)]
+        shown = [(x, z) if is_kink else (y,) for is_kink, x, y, z in zip(kink.tolist(), *features, strict=True)]
+        numbers = (motion.parameters(root), motion.piece_at[root.astype(int)], here.gap, bounds)
+        columns = (
+            *(x.tolist() for x in numbers),
+            map(tuple, self.pairs.parts[:, k].T.tolist()),
+            np.moveaxis(places, -1, 0),
+            shown,
+        )
+        return [Least._make(x) for x in zip(*columns, fixed.tolist(), strict=True)]
 
     def touches(self) -> list[tuple[int, Stretches]]:
         """Return the stretches of u in which pairs of parts touch, with the numbers of the pairs of links."""
-        rows = np.concatenate([np.zeros((0, 6)), *self.crossings])
-        k, piece = rows[:, :2].T.astype(int)
-        places = _roots(lambda u, some: self.gaps(k[some], piece[some], u), rows[:, 2], rows[:, 3], np.arange(len(rows)))
-        found, falls = [], rows[:, 4] >= 0
-        at_ends = [
-            self._at_nodes(np.repeat(np.arange(len(self.least)), len(x)), np.tile(x, len(self.least))).reshape(-1, len(x)) < 0
-            for x in (self.starts, self.ends)
-        ]
-        for pair, owner in enumerate(self.pairs.owner.tolist()):
+        at_start, at_end = self.touching_at_ends
+        rows = np.concatenate([np.zeros((5, 0)), *self.crossings], 1)
+        k, motion, (s0, s1, d0, d1) = rows[0].astype(int), self.motion, rows[1:]
+        places = motion.parameters(_roots(lambda s, i: self._gaps(k[i], s), s0, s1, d0, d1, 0.5 * (s0 + s1)))
+        found, falls = [], d0 >= 0
+        for pair in np.flatnonzero(at_start.any(1) | (np.bincount(k, minlength=len(self.least)) > 0)).tolist():
             begins, ceases = (
-                np.sort(np.append(places[(k == pair) & (falls == first)], self.motion.u[ends][touching[pair]]))
-                for first, ends, touching in zip((True, False), (self.starts, self.ends), at_ends, strict=True)
+                np.sort(np.append(places[(k == pair) & (falls == first)], motion.motion.u[ends][touching[pair]]))
+                for first, ends, touching in ((True, motion.starts, at_start), (False, motion.ends, at_end))
             )
-            found.append((owner, list(zip(begins.tolist(), ceases.tolist(), strict=True))))
+            found.append((int(self.pairs.owner[pair]), list(zip(begins.tolist(), ceases.tolist(), strict=True))))
         return found
 
 
-def _roots(f: Callable[[Any, Any], Any], low: np.ndarray, high: np.ndarray, some: np.ndarray) -> np.ndarray:
-    """Return the roots of the functions with the indices `some`, between parameters at which their signs differ."""
-    return find_root(lambda x, some: f(x, some.astype(int)), (low, high), args=(some,)).x if len(some) else low
+def _roots(
+    f: Callable[[Any, Any], Any], low: np.ndarray, high: np.ndarray, f_low: np.ndarray, f_high: np.ndarray, guess: np.ndarray
+) -> Float[np.ndarray, "n"]:
+    """Return roots of functions between places at which their values have different signs; f takes places and indices.
+
+    Secants, by which one end moves to the root; the value at an end that stays is reduced.
+    Source: N. Anderson and A. Bjorck, A new high order method of regula falsi type, BIT 13 (1973).
+    """
+    (a, b), (fa, fb), i = np.array([low, high]), np.array([f_low, f_high]), np.arange(len(low))
+    place = guess
+    for _ in range(MOST_STEPS):
+        if not len(i):
+            break
+        far, near, f_far, f_near = a[i], b[i], fa[i], fb[i]
+        value = f(place, i)
+        passed = (value < 0) != (f_near < 0)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            share = 1.0 - value / f_near
+        a[i], fa[i] = np.where(passed, near, far), np.where(passed, f_near, f_far * np.where(share > 0, share, 0.5))
+        b[i], fb[i] = place, value
+        step = np.minimum(np.abs(place - near), np.abs(place - a[i]))
+        i = i[(value != 0) & (step > LAST_STEP)]
+        place = b[i] - fb[i] * (b[i] - a[i]) / (fb[i] - fa[i])
+    return b
 
 
 def _joined(stretches: Stretches) -> Stretches:

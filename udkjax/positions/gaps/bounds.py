@@ -1,0 +1,139 @@
+"""Lower bounds of signed distances of convex parts over intervals within one polynomial of a motion.
+
+With any unit vectors n(u), the signed distance is at least min n.(b - a) over all corners a and b. Let n turn with the closest
+features at an end of the interval. If they are a corner and an edge, n is the normal of the edge. If they are two corners, with r
+from the one to the other, n = r / |r|, and n.(b - a) is |r|, plus r.(b - b') / |r| and r.(a' - a) / |r| for the other corners.
+
+All these are products of two vectors. Each is above the cubic with its values and slopes at both ends, minus F h^4 / 384, with F
+a bound of its fourth derivative by Leibniz's rule. So a gap that is constant, or least within the interval, is proven without
+splitting it into parts as short as bounds of the second derivative require.
+"""
+
+from math import comb
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from udkjax.positions.gaps.convex import Feature
+from udkjax.positions.gaps.motion_tables import ORDERS
+
+
+class Moving(NamedTuple):
+    """Vectors (..., 2, ends, n) at both ends of n intervals, or products of them (..., ends, n), and their derivatives by u."""
+
+    at: Any
+    rate: Any
+
+    def __sub__(self, other: "Moving") -> "Moving":
+        return Moving(self.at - other.at, self.rate - other.rate)
+
+    def dot(self, other: "Moving") -> "Moving":
+        """Return the scalar products of vectors."""
+        return Moving(_dot(self.at, other.at), _dot(self.rate, other.at) + _dot(self.at, other.rate))
+
+    def one(self, corner: Any, k: Any) -> "Moving":
+        """Return one corner in each of the intervals k."""
+        return Moving(*(np.moveaxis(x[corner, :, :, k], 0, -1) for x in self))
+
+    def take(self, k: Any) -> "Moving":
+        """Return all of them in the intervals k."""
+        return Moving(self.at.take(k, -1), self.rate.take(k, -1))
+
+
+def _dot(x: Any, y: Any) -> Any:
+    return x[..., 0, :, :] * y[..., 0, :, :] + x[..., 1, :, :] * y[..., 1, :, :]
+
+
+class MovingPart(NamedTuple):
+    """A convex part of each pair in n intervals.
+
+    Attributes:
+        corners: its corners (V, 2, ends, n).
+        origin: places of the origin of its body (2, ends, n).
+        turn: derivatives of its angle by u (ends, n).
+        reach: the largest distance of a corner from the origin (n).
+        places: bounds of the derivatives of the origin (orders, n).
+        directions: bounds of unit vectors that turn with the body, and of their derivatives (1 + orders, n).
+    """
+
+    corners: Moving
+    origin: Any
+    turn: Any
+    reach: Any
+    places: Any
+    directions: Any
+
+
+def _fourth_of_product(one: Any, other: Any) -> Any:
+    """Return bounds of the fourth derivatives of products of vectors by bounds of their derivatives (1 + orders, n)."""
+    return sum(comb(ORDERS, k) * one[k] * other[ORDERS - k] for k in range(ORDERS + 1))
+
+
+def least_of_cubics(f: Moving, h: Any) -> tuple[Any, Any]:
+    """Return the least values over intervals h of cubics with given values and slopes (..., ends, n) at both ends, and where.
+
+    The second result is the fraction of the interval up to which the cubic falls, or to its end.
+    """
+    (f0, f1), (d0, d1) = np.moveaxis(f.at, -2, 0), np.moveaxis(f.rate, -2, 0) * h
+    # f0 + d0 t + c2 t^2 + c3 t^3; its slope d0 + 2 c2 t + 3 c3 t^2 rises through zero at a minimum
+    c2, c3 = 3 * (f1 - f0) - 2 * d0 - d1, 2 * (f0 - f1) + d0 + d1
+    root = np.sqrt(np.maximum(c2 * c2 - 3 * c3 * d0, 0.0))
+    over, under = np.where(c2 >= 0, -d0, root - c2), np.where(c2 >= 0, c2 + root, 3 * c3)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        t = np.nan_to_num(np.clip(over / under, 0.0, 1.0))
+    return np.minimum(np.minimum(f0, f1), f0 + t * (d0 + t * (c2 + t * c3))), t
+
+
+def bounds_by_features(
+    A: MovingPart, B: MovingPart, features: Feature, h: Float[np.ndarray, "n"]
+) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
+    """Return lower bounds of signed distances over intervals h, and the fractions of these at which they are about least.
+
+    `features` (ends, n) are the closest features at both ends.
+    """
+    derivatives = A.places + A.reach * A.directions[1:] + B.places + B.reach * B.directions[1:]
+    share, way = h**4 / 384, B.origin - A.origin
+    apart = np.sqrt((way * way).sum(0).max(0)) + A.reach + B.reach + 0.5 * h * derivatives[0]
+    relative = np.concatenate([apart[None], derivatives])  # of vectors from corners of A to those of B
+    is_edge = features.at == 0
+    low, at = np.empty(is_edge.shape), np.empty(is_edge.shape)
+    for one, other, mask in ((A, B, is_edge & features.of_a), (B, A, is_edge & ~features.of_a)):
+        end, k = np.nonzero(mask)
+        if len(k):
+            start, stop = (other.corners.one(x[end, k], k) for x in (features.start, features.end))
+            way = stop.at - start.at
+            length = np.sqrt((way * way).sum(0))
+            n = np.stack([way[1], -way[0]]) * (features.side[end, k] / np.where(length > 0, length, np.nan))
+            normal = Moving(n, other.turn[:, k] * np.stack([-n[1], n[0]]))
+            least, t = least_of_cubics((one.corners.take(k) - start).dot(normal), h[k])
+            first, every = least.argmin(0), np.arange(len(k))
+            error = _fourth_of_product(other.directions[:, k], relative[:, k]) * share[k]
+            low[end, k], at[end, k] = least[first, every] - error, t[first, every]
+    end, k = np.nonzero(~is_edge)
+    if len(k):
+        f = features.take((end, k))
+        nearest = np.where(f.at == 1, f.start, f.end)
+        corners = np.where(f.of_a, f.corner, nearest), np.where(f.of_a, nearest, f.corner)
+        low[end, k], at[end, k] = _bounds_by_corners(A, B, *corners, relative, h, k)
+    return np.fmax(low[0], low[1]), np.where(low[0] >= low[1], at[0], at[1])  # NaN by an edge without length
+
+
+def _bounds_by_corners(
+    A: MovingPart, B: MovingPart, corner_a: Any, corner_b: Any, relative: Any, h: Any, k: Any
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return lower bounds over the intervals k by the closest corners of both parts, and where these are closest."""
+    relative, h = relative[:, k], h[k]
+    share, a, b = h**4 / 384, A.corners.one(corner_a, k), B.corners.one(corner_b, k)
+    r = b - a
+    square, t = least_of_cubics(r.dot(r), h)
+    square -= _fourth_of_product(relative, relative) * share
+    beside = np.zeros(len(k))
+    for part, corner, ways in ((A, corner_a, a - A.corners.take(k)), (B, corner_b, B.corners.take(k) - b)):
+        if len(ways.at) > 1:
+            of_ways = 2 * part.reach[k] * part.directions[:, k]
+            least = least_of_cubics(ways.dot(r), h)[0] - _fourth_of_product(of_ways, relative) * share
+            least[corner, np.arange(len(k))] = 0.0
+            beside += least.min(0)
+    distance = np.sqrt(np.where(square > 0, square, np.inf))
+    return np.where(square > 0, distance + beside / distance, -np.inf), t
