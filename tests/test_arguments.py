@@ -96,6 +96,17 @@ def test_a_state_of_a_wrong_shape_or_type_is_refused(name):
         jax.eval_shape(lambda q: call(name, state=udk.State(q, q)), jnp.zeros((1, 3)))
 
 
+def test_results_that_have_a_state_are_answered_with_it():
+    mech = udk.library.four_bar()
+    wrong: dict[str, Any] = {"not an Equilibrium; give its state: state=x.state": udk.equilibrium(mech)}
+    at_times = "not a {}; give the state at one of its times: state=udk.State(x.q[k], x.v[k])"
+    wrong[at_times.format("Solution")] = udk.simulate(mech, [0.0, 0.1])
+    wrong[at_times.format("Kinematics")] = udk.kinematics(mech, "body.crank.angle", [1.0, 1.1])
+    for text, given in wrong.items():
+        with pytest.raises(TypeError, match=re.escape(text)):
+            udk.modes(mech, given)
+
+
 @pytest.mark.parametrize("name", [*functions_of("q"), *(f"equations.{x}" for x in ("psi", "psi_q", "force", "potential_energy"))])
 def test_coordinates_of_a_wrong_shape_or_type_are_refused(name):
     function = getattr(udk.equations, name.split(".")[1]) if "." in name else getattr(udk, name)

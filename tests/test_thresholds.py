@@ -176,6 +176,44 @@ def rests() -> dict[str, Any]:
     return found | {"turns": turns.q, "efforts": efforts.without_friction / 10}
 
 
+def bars(beside: float) -> udk.Mechanism:
+    """A four-bar whose links fold flat together, but for a difference of one length."""
+    pins = {
+        "O": (0, 0),
+        "C": (4.0 + beside, 0),
+        "A": udk.polar("O", 1.5, np.deg2rad(60)),
+        "B": udk.circles(("A", "C"), (4, 1.5), "left"),
+    }
+    links = {
+        "crank": udk.Link(["O", "A"], mass=1.0),
+        "coupler": udk.Link(["A", "B"], mass=1.0),
+        "rocker": udk.Link(["C", "B"], mass=1.0),
+    }
+    return udk.Drawing(pins=pins, links=links, ground=["O", "C"]).mechanism()
+
+
+def followed_turns() -> dict[str, Any]:
+    """Turns of linkages at change points and beside them, in few steps and in many: statuses, positions and velocities."""
+    found: dict[str, Any] = {}
+    for beside, count in product((0.0, 1e-9, 1e-6, 1e-4, 1e-2, -1e-2), (7, 40, 200)):
+        folded = udk.library.slider_crank(0.4, driven=False, crank=0.3, rod=0.3 + beside)
+        for name, mechanism in (("four-bar", bars(beside)), ("slider-crank", folded)):
+            driver, start = f"body.{mechanism.body_names[0]}.angle", float(mechanism.q0[0, 2])
+            turn = udk.kinematics(mechanism, driver, start + np.linspace(0.0, 2 * np.pi, count))
+            found[f"{name}, {beside:g}, {count}"] = turn.status, turn.q
+    return found
+
+
+def linearized_rests() -> dict[str, Any]:
+    """Positions of rest of chains and linkages of one freedom, started far from them, and their frequencies."""
+    scenes = {name: getattr(udk.library, name)() for name in ("four_bar", "slider_crank", "scissor_lift", "compound_pendulum")}
+    found: dict[str, Any] = {}
+    for name, mechanism in scenes.items():
+        rest = udk.equilibrium(mechanism)
+        found[name] = rest.q, udk.modes(mechanism, rest.state).frequencies
+    return found
+
+
 def hidden_numbers() -> dict[str, Any]:
     """Tolerances of which one number would hide another, and others that are independent, on several mechanisms."""
     given = {
@@ -255,6 +293,8 @@ CASES: dict[str, tuple[Callable[[], dict[str, Any]], tuple[str, ...], float]] = 
         name: (least_gaps, (f"positions.gaps.{name}",), 1e-9)
         for name in ("search.PROVEN", "search.OPENED", "search.BESIDE", "search.LAST_STEP", "motion.FOLLOWED")
     },
+    "KEEPS_SIDE": (followed_turns, ("native.closing.marching.KEEPS_SIDE",), 1e-8),
+    "CLEARLY_ALONG": (linearized_rests, ("statics.linearization.CLEARLY_ALONG",), 1e-9),
     "JAMMING_TIMES": (jams, ("integrate.causes.jamming.JAMMING_TIMES",), 0.0),
 }
 USUAL: dict[Any, Any] = {}

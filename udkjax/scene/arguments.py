@@ -230,7 +230,11 @@ def _describe_class(cls: type) -> str:
 
 
 def _remedy(name: str, value: Any, classes: Sequence[type]) -> str:
-    """Return the advice to give an instance, if the value is a class or its name; else an empty string."""
+    """Return the advice to give an instance of a class, or the state of a result; else an empty string."""
+    if (state := getattr(value, "state", None)) is not None and isinstance(state, tuple(classes)):
+        return f"; give its state: {name}=x.state"
+    if any(x.__name__ == "State" for x in classes) and np.ndim(getattr(value, "q", None)) == 3 and hasattr(value, "v"):
+        return f"; give the state at one of its times: {name}=udk.State(x.q[k], x.v[k])"
     wanted = value if isinstance(value, str) else value.__name__ if isclass(value) else ""
     class_name = {x.__name__.lower(): x.__name__ for x in _with_subclasses(classes)}.get(wanted.strip("() ").lower())
     return (

@@ -64,13 +64,15 @@ def _by_jax(
     units, share, weights = analysis.coordinate_units, 1 / jnp.sqrt(w), scales.length / analysis.row_units
     coordinates = [value_of(mechanism, element) for element in values]
     directed = DirectedFriction.put_in(mechanism)
-    fastest = jax.lax.stop_gradient(scales.size(jnp.where(jnp.isfinite(v), v, 0.0)))
+    fastest, quickest = (jax.lax.stop_gradient(scales.size(jnp.where(jnp.isfinite(x), x, 0.0))) for x in (v, a))
 
     def at(t: Array, q: Array, v: Array, a: Array) -> tuple[Array, Array, Array]:
         q, v, a = q.ravel(), v.ravel(), a.ravel()
-        speed = directed.sliding_speeds(q, v)
-        moves = jnp.abs(speed) > AT_REST.closed * fastest * directed.units(scales.length)
-        sides = jax.lax.stop_gradient(jnp.stack([jnp.where(moves, jnp.sign(speed), 0.0), jnp.zeros(len(speed))], axis=-1))
+        speed, rate = jax.jvp(directed.sliding_speeds, (q, v), (v, a))
+        least = AT_REST.closed * directed.units(scales.length)
+        moves, starts = jnp.abs(speed) > least * fastest, jnp.abs(rate) > least * quickest
+        way = jnp.where(moves, jnp.sign(speed), jnp.where(starts, jnp.sign(rate), 0.0))  # from rest, that of the acceleration
+        sides = jax.lax.stop_gradient(jnp.stack([way, jnp.zeros(len(speed))], axis=-1))
         mechanism = directed.with_sides(sides)
         C = jax.jacfwd(lambda q: jnp.stack([c(q.reshape(-1, 3)) for c in coordinates]))(q)
         J = weights[:, None] * constraints.psi_q(mechanism, t, q) * units

@@ -8,7 +8,8 @@ the joints' rows J and the drivers' rows C of Psi_q, the equation of motion is
 The joints carry any force in the range of J^T; the drivers must supply the rest. With N a basis of the null space of J,
 N^T (M a - F) = (C N)^T f: one equation for each degree of freedom. If there are more drivers than degrees of freedom, f is the
 solution with the least sum_i w_i f_i^2. Friction is in F, of both laws, with mu of least norm where it depends on the loads of
-joints; a joint at rest has none of the set-valued law (`holding_efforts` has the bounds). Where branches meet, N has another
+joints; a joint at rest has none of the set-valued law (`holding_efforts` has the bounds), and one that starts from rest that of
+the direction in which it accelerates. Where branches meet, N has another
 column, along the other branch, in which the joints carry load too; with one degree of freedom, N is therefore replaced by the
 direction v of the motion.
 """
@@ -26,7 +27,7 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from udkjax.annotations import NumberLike
-from udkjax.argument_types import HISTORY, NUMBERS_BY_NAME, TIMES, ArgumentRequirement, of_kind
+from udkjax.argument_types import NUMBERS_BY_NAME, TIMES, ArgumentRequirement, of_kind, require_history
 from udkjax.arrays import is_traced, is_within_jit, library_for, make_module, number, number_called, put_arrays
 from udkjax.equations.rows.analysis import analyse
 from udkjax.positions.assembling.channels import StateHistory
@@ -34,6 +35,7 @@ from udkjax.positions.assembling.coordinates import Coordinate, element_of
 from udkjax.positions.following.drive import without_drivers
 from udkjax.positions.following.kinematics import Kinematics, motion_in_time
 from udkjax.printing import PrintedTable, PrintsTable, fields_table, format_number, units
+from udkjax.requirements import ArgumentError, ArgumentTypeError, GivenArguments
 from udkjax.scene.arguments import checked
 from udkjax.scene.elements.drivers import Motion, Spline
 from udkjax.scene.elements.fields import CALLED
@@ -41,7 +43,7 @@ from udkjax.scene.elements.forces import ForceElement
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.tables.checks import SceneError
 from udkjax.study.driver_efforts import driver_efforts, elements_of
-from udkjax.wording import free_name, quote
+from udkjax.wording import article, free_name, quote
 
 
 class InverseDynamics(PrintsTable):
@@ -154,11 +156,28 @@ DRIVERS = ArgumentRequirement(
 )
 
 
+def require_accelerated_history(name: str, value: Any, given: GivenArguments) -> None:
+    """Require times, states and accelerations, such as a `Kinematics` has."""
+    require_history(name, value, given)
+    if not hasattr(value, "a"):
+        kind = type(value).__name__
+        raise ArgumentTypeError(
+            f"{name} must have accelerations a (T, bodies, 3), as a Kinematics; {article(kind)} {kind} has none: "
+            "compute them, by udkjax.accelerations at each state of a run, and give an object with ts, q, v and a"
+        )
+    shapes = [np.shape(x) for x in (value.a, value.q)]
+    if shapes[0] != shapes[1]:
+        raise ArgumentError(f"{name}.a must have the shape of {name}.q, {shapes[1]}, not {shapes[0]}")
+
+
+ACCELERATED_HISTORY = ArgumentRequirement("times, states and accelerations of the mechanism", require_accelerated_history)
+
+
 @checked
 def inverse_dynamics(
     mechanism: Mechanism,
     ts: Annotated[Float[ArrayLike, "T"] | Sequence[float], TIMES],
-    motion: Annotated[AcceleratedTrajectory, HISTORY] | None = None,
+    motion: Annotated[AcceleratedTrajectory, ACCELERATED_HISTORY] | None = None,
     drivers: Annotated[Sequence[str | Coordinate], DRIVERS] | None = None,
     weights: Annotated[Mapping[str, NumberLike], NUMBERS_BY_NAME] | None = None,
 ) -> InverseDynamics:
