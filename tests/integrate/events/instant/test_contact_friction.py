@@ -332,6 +332,30 @@ def test_derivatives_pass_through_impacts_with_friction():
     np.testing.assert_allclose(forward, np.stack(differences, axis=1), rtol=1e-6, atol=1e-7)
 
 
+def test_derivatives_where_an_impact_ends_all_sliding():
+    """Against differences: the lock of a foot that sticks at once, or of a joint that hits its limit, is at its place there."""
+    rough = udk.Mechanism({"rod": udk.Body(1.0, 0.03, [0.0, 0.5], 0.9, velocity=[0.4, 0.0])})
+    foot = udk.Contact("rod", [-0.3, 0.0], coefficient=0.9, name="foot")
+    rail = {"rail": udk.Prismatic(["ground", "block"], [[0.0, 0.0], [0.0, 0.0]], axis=0.0)}
+    rub = {"rub": udk.Friction("rail", coefficient=0.1, law="set-valued")}
+    block = udk.Mechanism({"block": udk.Body(1.0, 0.1, velocity=[2.0, 0.0])}, rail, forces=rub)
+
+    def fallen(height):
+        started = rough.with_parameters({"body.rod.position": jnp.stack([0 * height, height])})
+        return udk.simulate(started, [0.0, 0.25, 0.4], events=foot, rtol=1e-10, atol=1e-10)
+
+    def stopped(limit):
+        return udk.simulate(block, [0.0, 0.3, 0.6], events=udk.JointLimit("rail", upper=limit), rtol=1e-10, atol=1e-10)
+
+    for run, joint in ((fallen, "foot"), (stopped, "rail")):
+        end = lambda x, run=run: run(x).q[1:].ravel()  # noqa: E731
+        x, h = jnp.asarray(0.5), 1e-5
+        assert run(x).sticking[joint][1]
+        change = (end(x + h) - end(x - h)) / (2 * h)
+        assert np.abs(change).max() > 0.9
+        np.testing.assert_allclose(jax.jacfwd(end)(x), change, rtol=1e-6, atol=1e-8)
+
+
 @pytest.mark.slow
 def test_beside_joints_that_stick_and_answers_about_the_run():
     """A wall stops a sledge whose brake sticks to it; reactions and powers of a run with contacts that stick can be asked for."""

@@ -283,7 +283,8 @@ def hit_contacts(
 
     if known is not None:
         impact, no = impulses(restitution), xp.zeros_like(touches)
-        return ContactChanges(velocities(impact), closed, no, known.held, known.held, no, no, impact.remaining)
+        is_held = xp.where(contacts.impacts, known.held, held)  # locks of joints begin later, at the places of the joints then
+        return ContactChanges(velocities(impact), closed, no, is_held, is_held, no, no, impact.remaining)
     # The set of held contacts is discrete, and has no derivatives.
     W, fixed_rate, pressed = stop(rows.W), stop(rate), ZERO_RATE_2 * scale * system**2
     may_stay = (touches) & rows.free & (np.arange(rate.shape[-1]) + rate.shape[-1] != k[..., None])
