@@ -77,11 +77,11 @@ from udkjax.positions.assembling.coordinates import Coordinate as Coordinate
 from udkjax.positions.following.branches import branches as branches
 from udkjax.positions.following.continuation import Reached as Reached
 from udkjax.positions.following.kinematics import Kinematics as Kinematics
-from udkjax.positions.following.kinematics import Travel as Travel
 from udkjax.positions.following.kinematics import kinematics as kinematics
-from udkjax.positions.following.kinematics import travel as travel
 from udkjax.positions.following.position_batch import BatchPositions as BatchPositions
 from udkjax.positions.following.position_batch import PositionBatch as PositionBatch
+from udkjax.positions.following.travel import Travel as Travel
+from udkjax.positions.following.travel import travel as travel
 from udkjax.positions.gaps.gaps import LeastGap as LeastGap
 from udkjax.positions.gaps.gaps import LeastGaps as LeastGaps
 from udkjax.positions.gaps.gaps import Touch as Touch

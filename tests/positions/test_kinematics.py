@@ -136,7 +136,7 @@ def geared_five_bar():
 def test_travel_without_a_limit_is_followed_once_if_a_turn_leads_back(mechanism, driver, limits, monkeypatch):
     found = udk.travel(mechanism(), driver)
     assert tuple(bool(np.isfinite(x)) for x in (found.lower, found.upper)) == limits
-    monkeypatch.setattr(import_module("udkjax.positions.following.kinematics"), "_returns", lambda *given: False)
+    monkeypatch.setattr(import_module("udkjax.positions.following.travel"), "_returns", lambda *given: False)
     both_ways = udk.travel(mechanism(), driver)
     for name in ("lower", "upper", "lower_q", "upper_q", "status"):
         np.testing.assert_allclose(getattr(found, name), getattr(both_ways, name), rtol=1e-12)

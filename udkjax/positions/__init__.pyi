@@ -65,10 +65,10 @@ from udkjax.positions.following.free_numbers import position_model as position_m
 from udkjax.positions.following.kinematics import Kinematics as Kinematics
 from udkjax.positions.following.kinematics import kinematics as kinematics
 from udkjax.positions.following.kinematics import motion_in_time as motion_in_time
-from udkjax.positions.following.kinematics import travel as travel
 from udkjax.positions.following.position_batch import BatchPositions as BatchPositions
 from udkjax.positions.following.position_batch import PositionBatch as PositionBatch
 from udkjax.positions.following.position_batch import compile_positions as compile_positions
+from udkjax.positions.following.travel import travel as travel
 from udkjax.positions.gaps.arithmetic import gap_in_position as gap_in_position
 from udkjax.positions.gaps.gaps import LeastGap as LeastGap
 from udkjax.positions.gaps.gaps import LeastGaps as LeastGaps

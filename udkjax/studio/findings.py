@@ -16,7 +16,8 @@ from udkjax.positions.assembling.assembly import AssemblyError, assemble
 from udkjax.positions.assembling.coordinates import value_of
 from udkjax.positions.following.continuation import Reached
 from udkjax.positions.following.drive import only_driver
-from udkjax.positions.following.kinematics import kinematics, travel
+from udkjax.positions.following.kinematics import kinematics
+from udkjax.positions.following.travel import travel
 from udkjax.positions.gaps.gaps import gaps
 from udkjax.scene.elements.joints import Revolute
 from udkjax.scene.mechanism import Mechanism

@@ -9,7 +9,8 @@ from jaxtyping import Float
 from udkjax.arrays import FULL_TURN
 from udkjax.positions.assembling.coordinates import Coordinate, value_of
 from udkjax.positions.following.continuation import Reached
-from udkjax.positions.following.kinematics import Kinematics, kinematics, travel
+from udkjax.positions.following.kinematics import Kinematics, kinematics
+from udkjax.positions.following.travel import travel
 from udkjax.scene.mechanism import Mechanism
 
 GRID = 721  # values of a driver over its range: half a degree apart over a turn

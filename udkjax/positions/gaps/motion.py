@@ -14,7 +14,8 @@ from jaxtyping import Bool, Float, Int
 from udkjax.arrays import FULL_TURN
 from udkjax.positions.assembling.channels import StateHistory
 from udkjax.positions.assembling.coordinates import Coordinate, value_of
-from udkjax.positions.following.kinematics import kinematics, travel
+from udkjax.positions.following.kinematics import kinematics
+from udkjax.positions.following.travel import travel
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.tables.checks import SceneError
 

@@ -12,7 +12,7 @@ import numpy as np
 from udkjax.positions.answers.counting import Count
 from udkjax.positions.assembling.assembly import AssemblyError
 from udkjax.positions.following.drive import only_driver
-from udkjax.positions.following.kinematics import travel
+from udkjax.positions.following.travel import travel
 from udkjax.scene.drawing import Drawing
 from udkjax.scene.drawing.drawn_quantities import Units
 from udkjax.scene.mechanism import Mechanism
