@@ -6,8 +6,9 @@ from pathlib import Path
 
 from udkjax.positions.answers.pin_motion import PinMotion
 from udkjax.printing import PrintedTable
-from udkjax.study.worked.equations import NO_TERMS, LoopSolution
 from udkjax.study.worked.figures import PolygonSide, drawing_figure, polygon_figure
+from udkjax.study.worked.linear_equations import NO_TERMS
+from udkjax.study.worked.loop_solutions import LoopSolution
 from udkjax.study.worked.loops import Geometry
 from udkjax.study.worked.terms import EquationLine, NamedQuantity, NumberStyle
 

@@ -22,11 +22,12 @@ from udkjax.scene.elements.bodies import GROUND
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.tables.checks import SceneError
 from udkjax.statics.resting_forces import has_gravity, resting_forces
-from udkjax.study.worked.equations import LoopSolution, PositionSymbols, solution_of
 from udkjax.study.worked.figures import PolygonSide
 from udkjax.study.worked.iterations import PositionRates
+from udkjax.study.worked.loop_solutions import LoopSolution, solution_of
 from udkjax.study.worked.loops import Geometry, drawing_of, loops_of
 from udkjax.study.worked.page import page_of
+from udkjax.study.worked.symbols import PositionSymbols
 from udkjax.study.worked.terms import EquationLine, EquationTerm, NamedQuantity, NumberStyle, ProductOfTerms, total
 
 

@@ -1,0 +1,59 @@
+"""Symbols of a position, and the components of vectors in them."""
+
+from udkjax.scene.elements.bodies import GROUND
+from udkjax.study.worked.iterations import PositionRates
+from udkjax.study.worked.loops import LoopVector
+from udkjax.study.worked.terms import (
+    EquationLine,
+    EquationTerm,
+    NamedQuantity,
+    ProductOfTerms,
+    of_angle,
+    total,
+)
+
+AXES = ("x", "y")
+NAMES = ("cos", "sin")
+
+
+class PositionSymbols:
+    """The symbols of a position: lengths, angles and their derivatives, with their values."""
+
+    def __init__(self, rates: PositionRates, pins_of_slides: dict[str, str]):
+        self.rates, self.pins = rates, pins_of_slides
+
+    def angle(self, body: str, order: int = 0) -> NamedQuantity:
+        """Return the angle of a body, its angular velocity or its angular acceleration."""
+        letter, unit = (("θ", "rad"), ("ω", "rad/s"), ("α", "rad/s2"))[order]
+        return NamedQuantity(letter, body, self.rates.angles[body][order], unit)
+
+    def length(self, vector: LoopVector, order: int = 0) -> NamedQuantity:
+        """Return the length of a vector; for one along a line also its derivatives."""
+        if not vector.slide:
+            return NamedQuantity("r", vector.start + vector.end, vector.size, "m")
+        return NamedQuantity(
+            "s", self.pins[vector.slide], self.rates.slides[vector.slide][order], ("m", "m/s", "m/s2")[order], order
+        )
+
+    def direction(self, vector: LoopVector) -> EquationTerm:
+        """Return the angle of a vector: that of its body, plus a constant one."""
+        if vector.body == GROUND:
+            return NamedQuantity("φ", vector.start + vector.end, vector.turn, "rad")
+        angle = self.angle(vector.body)
+        return total((1.0, angle), (1.0, self.turn(vector))) if vector.turn else angle
+
+    @staticmethod
+    def turn(vector: LoopVector) -> NamedQuantity:
+        """Return the constant angle between a vector and its body."""
+        return NamedQuantity("δ", vector.start + vector.end, vector.turn, "rad")
+
+
+def component(symbols: PositionSymbols, vector: LoopVector, axis: int) -> EquationTerm:
+    """Return the component of a vector along x or y."""
+    return ProductOfTerms((symbols.length(vector), of_angle(NAMES[axis], symbols.direction(vector))))
+
+
+def defined(letter: str, index: str, right: EquationTerm, unit: str) -> tuple[NamedQuantity, EquationLine]:
+    """Return a symbol with the value of a right side, and the line that defines it."""
+    found = NamedQuantity(letter, index, right.value, unit)
+    return found, EquationLine(right, found)
