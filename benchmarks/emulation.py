@@ -7,13 +7,13 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from udkjax.native import primitive, records
+from udkjax.native import loaded_code, primitive, records
 from udkjax.native.code import machine, processor
 from udkjax.native.derivatives.record import FIRST_POINTS, Recorded
 from udkjax.native.gpu.kernel import VECTOR, KernelCode, kernel_code
+from udkjax.native.loaded_code import BREAKS
 from udkjax.native.module.layout import INPUTS
 from udkjax.native.operations import Operation
-from udkjax.native.primitive import BREAKS
 
 ALONE = "define i1 @meet(i1 %goes_on) { ret i1 %goes_on }\n"  # a block of one thread
 
@@ -34,26 +34,28 @@ class Called(NamedTuple):
 
 def calls_of(function: Callable, *given: Any) -> list[Called]:
     """The calls of machine code with many members that a function makes."""
-    calls, call_members = [], primitive.call_members
+    calls, call_members = [], loaded_code.call_members
 
     def record(*inputs: Any, operation: Operation, times: int) -> list[np.ndarray]:
         arrays = [np.array(x, float) for x in inputs]  # copies, as callers may change theirs
-        code = primitive.machine_code(operation, 1, 1)  # dense methods round otherwise in lanes
+        code = loaded_code.machine_code(operation, 1, 1)  # dense methods round otherwise in lanes
         outputs = code(arrays, operation.shapes(arrays, times))
         calls.append(Called(operation, arrays, times, [np.array(x) for x in outputs]))
         return outputs
 
-    caches, lanes, largest = (primitive.generate, primitive.machine_code), processor.lanes, records.LARGEST
+    caches, lanes, largest = (loaded_code.generate, loaded_code.machine_code), processor.lanes, records.LARGEST
     for cache in caches:
         cache.cache_clear()
     # Sums over vectors depend on the size of a register.
-    primitive.call_members, processor.lanes = record, lambda: VECTOR
+    primitive.call_members = loaded_code.call_members = record
+    processor.lanes = lambda: VECTOR
     records.LARGEST = 0  # as for the large batches of kernels
     try:
         with jax.disable_jit():
             function(*given)
     finally:
-        primitive.call_members, processor.lanes, records.LARGEST = call_members, lanes, largest
+        primitive.call_members = loaded_code.call_members = call_members
+        processor.lanes, records.LARGEST = lanes, largest
         for cache in caches:
             cache.cache_clear()
     return [call for call in calls if call.outputs[0].shape[0] > 1]

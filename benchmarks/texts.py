@@ -11,8 +11,8 @@ import diffrax
 import udkjax as udk
 from udkjax.integrate.compiled_mechanism import compile_mechanism
 from udkjax.native.code import processor
+from udkjax.native.loaded_code import generate
 from udkjax.native.operations import Operation
-from udkjax.native.primitive import generate
 from udkjax.native.runs import RunStates
 
 SCENES = (

@@ -25,7 +25,7 @@ from tests.quick_code import optimize
 from tests.skipped import skipped_for
 from udkjax import arrays
 from udkjax.folders import is_writable
-from udkjax.native import primitive
+from udkjax.native import loaded_code
 from udkjax.native.code import code_cache
 
 optimize(False)  # but in tests/native
@@ -92,11 +92,11 @@ def compilations():
 
     def during(run) -> list[float]:
         seen.clear()
-        before = primitive.machine_code.cache_info().misses
+        before = loaded_code.machine_code.cache_info().misses
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(arrays, "_WORTH_A_PROGRAM", math.inf)  # from some call on a program puts arrays on the device
             run()
-        return [*seen, *[0.0] * (primitive.machine_code.cache_info().misses - before)]
+        return [*seen, *[0.0] * (loaded_code.machine_code.cache_info().misses - before)]
 
     return during
 

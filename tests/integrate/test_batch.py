@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose
 import udkjax as udk
 from tests.calls import calls_of
 from udkjax.equations.programs.unrolled import Unrolled
-from udkjax.native import primitive, runs
+from udkjax.native import loaded_code, runs
 
 TS = np.linspace(0.0, 2.0, 21)
 MEMBERS = 70  # no multiple of what a vector holds
@@ -108,7 +108,7 @@ def test_only_what_the_parameters_touch_is_differentiated():
         changed = linkage.with_parameters({"body.link1.mass": mass})
         return udk.simulate(changed, jnp.linspace(0.0, 1.0, 3), adjoint=diffrax.ForwardMode()).q[-1, 0, 2]
 
-    with calls_of(primitive._select_code) as found:
+    with calls_of(loaded_code.select_code) as found:
         jax.jit(jax.jacfwd(angle)).lower(1.0)
     (run,) = (x for x in (call.arguments["operation"] for call in found) if isinstance(x, runs.RunTangents))
     assert sum(run.active) == 1 and len(run.active) > 30

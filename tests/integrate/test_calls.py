@@ -16,7 +16,7 @@ import udkjax as udk
 from tests.calls import listening
 from udkjax.expressions import read_jaxpr
 from udkjax.integrate.events.run import condition_program
-from udkjax.native import primitive
+from udkjax.native import loaded_code
 from udkjax.programs.deferred import _trace, deferred_p
 
 ROOT = Path(udk.__file__).parent
@@ -51,7 +51,7 @@ def pendulums(count: int) -> udk.Mechanism:
 
 
 def test_few_functions_stand_between_a_call_and_machine_code(monkeypatch):
-    monkeypatch.setattr(primitive, "QUICK_MEMBERS", 0)  # by code that serves for good
+    monkeypatch.setattr(loaded_code, "QUICK_MEMBERS", 0)  # by code that serves for good
     mechanism = udk.library.parallelogram()
     udk.simulate(mechanism, TS)
     seen = called(lambda: udk.simulate(mechanism, TS))

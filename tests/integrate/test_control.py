@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose
 import udkjax as udk
 from udkjax.integrate.compiled_mechanism import compile_mechanism
 from udkjax.native.derivatives.record import STORED
-from udkjax.native.primitive import generate
+from udkjax.native.loaded_code import generate
 from udkjax.programs.deferred import deferred
 
 TORQUE, FORCE = np.array([1.0, 2.0, -1.0, 0.5]), np.array([[1.0, 0.0], [-2.0, 0.5], [3.0, 0.0]])

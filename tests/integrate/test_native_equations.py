@@ -17,7 +17,7 @@ from udkjax.integrate.compiled_mechanism import compile_mechanism
 from udkjax.integrate.native_engine import mark_rows
 from udkjax.integrate.native_equations import ConcreteRates, native_equations
 from udkjax.integrate.projection import Projection
-from udkjax.native.primitive import FEW
+from udkjax.native.loaded_code import FEW
 from udkjax.programs.deferred import deferred
 
 METHODS = [udk.Auto(), udk.Elimination(), udk.SVD(), udk.Varga(), udk.Householder(), udk.GramSchmidt(), udk.Greville()]

@@ -17,7 +17,7 @@ import udkjax as udk
 from tests.calls import calls_of
 from tests.choices import fast
 from udkjax import threads
-from udkjax.native import primitive, records
+from udkjax.native import loaded_code, records
 from udkjax.native.code import code_cache, machine
 from udkjax.native.derivatives import record
 from udkjax.native.host.ffi import handler
@@ -225,7 +225,7 @@ def test_threads_of_xla_share_a_large_batch():
 def test_a_limit_of_threads_holds_inside_and_outside_of_compiled_programs(monkeypatch, limit):
     monkeypatch.setattr(threads, "cores", lambda: 8)
     monkeypatch.setenv("UDKJAX_THREADS", str(limit or ""))
-    with jax.disable_jit(), calls_of(primitive.PreparedCall.__call__) as calls:
+    with jax.disable_jit(), calls_of(loaded_code.PreparedCall.__call__) as calls:
         jax.vmap(angles)(jnp.linspace(0.3, 0.45, 800))
     assert [call.arguments["self"].threads for call in calls] == [limit or 8]
     compared = re.findall(r"icmp slt i64 %\w+, 3\b", handler(Memory(), "call_frame")[-1].text())
@@ -286,19 +286,19 @@ RUNS = {
 @pytest.mark.parametrize(("refused", "run"), [*(("malloc", name) for name in RUNS), ("realloc", "reverse")])
 def test_every_allocation_is_checked(monkeypatch, record_length, refused, run):
     """All allocations of one kind fail: a call of malloc or realloc in the code is replaced by null."""
-    call, replaced, load = re.compile(rf"call ptr @{refused}\([^)]*\)"), [], primitive.load
+    call, replaced, load = re.compile(rf"call ptr @{refused}\([^)]*\)"), [], loaded_code.load
 
     def load_refused(text, *arguments):  # under the name of the changed text: code of the other stays in use
         replaced.extend(call.findall(text))
         return load(call.sub("inttoptr i64 0 to ptr", text), *arguments)
 
-    monkeypatch.setattr(primitive, "load", load_refused)
+    monkeypatch.setattr(loaded_code, "load", load_refused)
     record_length(1)  # so that the second pass allocates records,
     monkeypatch.setattr(record, "FIRST_POINTS", -4)  # too short ones
 
     def forget():  # what holds code under the name of an operation
-        primitive.machine_code.cache_clear()
-        primitive.generate.cache_clear()
+        loaded_code.machine_code.cache_clear()
+        loaded_code.generate.cache_clear()
         jax.clear_caches()
 
     forget()

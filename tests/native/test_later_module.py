@@ -10,7 +10,7 @@ import pytest
 
 import udkjax as udk
 from tests.native.test_implicit_stages import damped
-from udkjax.native import primitive
+from udkjax.native import loaded_code
 from udkjax.native.code import machine
 from udkjax.native.module import leaving, loading
 
@@ -25,8 +25,8 @@ def motion(monkeypatch, tmp_path):
     analysis, state = udk.analyse(mechanism), udk.assemble(mechanism)
 
     def forget():
-        primitive.generate.cache_clear()
-        primitive.machine_code.cache_clear()
+        loaded_code.generate.cache_clear()
+        loaded_code.machine_code.cache_clear()
         jax.clear_caches()
 
     def of_damping(damping):
@@ -105,7 +105,7 @@ def test_if_it_cannot_be_loaded_the_call_is_refused(motion, monkeypatch, capfd):
     def fail(*arguments):
         raise OSError("no module")
 
-    monkeypatch.setattr(primitive, "_load_later", fail)
+    monkeypatch.setattr(loaded_code, "_load_later", fail)
     jitted = jax.jit(motion)
     assert jitted(SOFT)[2] == 0
     with pytest.raises((ValueError, jax.errors.JaxRuntimeError), match="no memory for a computation by machine code"):
@@ -118,7 +118,7 @@ def test_the_first_module_has_no_implicit_method():
     engine = import_module("udkjax.integrate.compiled_mechanism")
     operation = engine.compile_concrete(scene, udk.analyse(scene), udk.Auto(), udk.Projection()).plan.operation
     assert operation.changes and not operation.leaves
-    first, later = (primitive.generate(x, 1, 1).written_text for x in (operation.first, operation))
+    first, later = (loaded_code.generate(x, 1, 1).written_text for x in (operation.first, operation))
     assert "@take_stages_from_point3(" in later and "@take_stages_from_point3(" not in first
     assert "_slopes(" in later and "_slopes(" not in first
     assert len(first) < 0.8 * len(later)

@@ -8,7 +8,7 @@ import pytest
 
 import udkjax as udk
 from tests.choices import fast
-from udkjax.native import primitive
+from udkjax.native import loaded_code
 from udkjax.native.module import loading
 from udkjax.programs import identity_cache
 from udkjax.programs.identity_cache import cached_by_size
@@ -52,7 +52,7 @@ def test_machine_code_that_is_dropped_is_unloaded_unless_compiled_programs_call_
     def run(count):
         bodies = {f"b{k}": udk.Body(1.0, 0.1, [k + 0.5, 0.0]) for k in range(count)}
         udk.simulate(udk.Mechanism(bodies, {"A": udk.Revolute(["ground", "b0"], [[0, 0], [-0.5, 0]])}), np.array([0.0, 0.1]))
-        (code,) = (x for x, _ in identity_cache._STORED.values() if isinstance(x, primitive.LoadedCode))
+        (code,) = (x for x, _ in identity_cache._STORED.values() if isinstance(x, loaded_code.LoadedCode))
         return code
 
     code = run(1)

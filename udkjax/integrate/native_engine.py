@@ -14,10 +14,11 @@ from udkjax.equations.laws.abstract_system import AbstractSystem
 from udkjax.equations.terms.structure import numbers_as_vector
 from udkjax.integrate.compiled_mechanism import CompiledMechanism, eliminates, formulation_of
 from udkjax.integrate.problem import IntegratorOutput, Problem
+from udkjax.native.loaded_code import call_concrete
 from udkjax.native.module.steps import Status
 from udkjax.native.operations import MarkRows
 from udkjax.native.packing import ActiveNumbers
-from udkjax.native.primitive import call_concrete, native_p
+from udkjax.native.primitive import native_p
 from udkjax.native.run.method_code import MethodCode
 from udkjax.native.runs import RunStates
 from udkjax.pinv import Auto, OneOf

@@ -25,8 +25,9 @@ from udkjax.equations.terms.structure import numbers_as_vector
 from udkjax.integrate.compiled_mechanism import CompiledMechanism, compile_concrete, evaluation_of
 from udkjax.integrate.native_engine import SceneInputs, mark_rows, scene_inputs
 from udkjax.integrate.problem import Problem
+from udkjax.native.loaded_code import machine_code
 from udkjax.native.operations import Accelerate, StateOperation
-from udkjax.native.primitive import machine_code, native_p
+from udkjax.native.primitive import native_p
 from udkjax.pinv import SVD, OneOf, Pseudoinverse
 from udkjax.scene.mechanism import Mechanism
 from udkjax.transforms.gradients import stop_gradients

@@ -16,8 +16,9 @@ How the code of a run is made, and where to look:
 5. watching/ ends runs at zero crossings of conditions, the events of `udkjax.integrate`.
 6. closing/ computes positions: `closing` assembles a mechanism, with derivatives, `marching` follows its positions, and
    `positions` computes batches of positions from the programs of equations/programs/position_programs.py.
-7. `operations`, `runs` and `position_operations` list the modules with the shapes of their inputs and outputs; `primitive` makes
-   the operations a JAX primitive with a batching rule. `udkjax.integrate` calls this primitive and defines its derivatives.
+7. `operations`, `runs` and `position_operations` list the modules with the shapes of their inputs and outputs. `loaded_code` has
+   the code of each operation, and calls it on concrete numbers; `primitive` makes the operations a JAX primitive with a batching
+   rule. `udkjax.integrate` calls this primitive and defines its derivatives.
 8. wasm/ compiles the same text for pages.
 9. gpu/ serves programs that JAX compiles for a graphics card: `host_handler` calls the code of the host, and `launch` runs large
    batches as kernels. host/`host_program` has the host run whole programs with loops.

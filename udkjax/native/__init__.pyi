@@ -14,6 +14,9 @@ from udkjax.native.host.host_function import call_seldom as call_seldom
 from udkjax.native.language.ir import Function as Function
 from udkjax.native.language.program import UnsupportedError as UnsupportedError
 from udkjax.native.language.program import vector_function as vector_function
+from udkjax.native.loaded_code import MemberCalls as MemberCalls
+from udkjax.native.loaded_code import call_concrete as call_concrete
+from udkjax.native.loaded_code import machine_code as machine_code
 from udkjax.native.module.steps import FACTORS as FACTORS
 from udkjax.native.module.steps import LOOK_AHEAD as LOOK_AHEAD
 from udkjax.native.module.steps import NORMAL_ERROR_WEIGHT as NORMAL_ERROR_WEIGHT
@@ -30,9 +33,6 @@ from udkjax.native.packing import ActiveNumbers as ActiveNumbers
 from udkjax.native.packing import SampleRows as SampleRows
 from udkjax.native.position_operations import Close as Close
 from udkjax.native.position_operations import March as March
-from udkjax.native.primitive import MemberCalls as MemberCalls
-from udkjax.native.primitive import call_concrete as call_concrete
-from udkjax.native.primitive import machine_code as machine_code
 from udkjax.native.primitive import native_p as native_p
 from udkjax.native.run.method_code import MethodCode as MethodCode
 from udkjax.native.run.state_functions import Evaluation as Evaluation

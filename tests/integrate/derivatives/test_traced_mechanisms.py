@@ -17,7 +17,7 @@ from udkjax.integrate.compiled_mechanism import compile_concrete
 from udkjax.integrate.native_engine import mark_rows
 from udkjax.integrate.prepare import AUTO
 from udkjax.integrate.projection import Projection
-from udkjax.native import primitive
+from udkjax.native import loaded_code
 from udkjax.native.run import row_marks
 
 TIMES = np.linspace(0.0, 2.0, 9)
@@ -70,8 +70,8 @@ def other_step(request, monkeypatch):
     """Multiply and divide the size of the trial step to the side by ten."""
 
     def forget():
-        primitive.generate.cache_clear()
-        primitive.machine_code.cache_clear()
+        loaded_code.generate.cache_clear()
+        loaded_code.machine_code.cache_clear()
 
     forget()
     monkeypatch.setattr(row_marks, "ASIDE", row_marks.ASIDE._replace(length=request.param))

@@ -9,7 +9,7 @@ from numpy.testing import assert_array_equal
 import udkjax as udk
 from tests.calls import calls_of
 from tests.choices import needs_deferred
-from udkjax.native import primitive
+from udkjax.native import loaded_code
 from udkjax.native.code import machine
 
 TS = np.linspace(0.0, 1.0, 11)
@@ -20,10 +20,10 @@ def calls(monkeypatch, tmp_path):
     """Calls by quickly compiled code: the code, its inputs, the shapes of its outputs, and its results."""
     monkeypatch.setenv("UDKJAX_CACHE", str(tmp_path))
     monkeypatch.setattr(machine, "_compiler", lambda: str(tmp_path))  # whose code nobody has loaded
-    primitive.machine_code.cache_clear()
-    with calls_of(primitive.LoadedCode._call_quickly) as made:
+    loaded_code.machine_code.cache_clear()
+    with calls_of(loaded_code.LoadedCode._call_quickly) as made:
         yield made
-    primitive.machine_code.cache_clear()
+    loaded_code.machine_code.cache_clear()
 
 
 def crank(length, method=None):
@@ -51,7 +51,7 @@ def test_both_codes_round_alike(calls, run):
 
 
 def test_a_run_of_many_steps_is_of_optimized_code(calls, monkeypatch):
-    monkeypatch.setattr(primitive, "QUICK_STEPS", 10)
+    monkeypatch.setattr(loaded_code, "QUICK_STEPS", 10)
     found = udk.simulate(udk.library.four_bar(), TS)
     assert calls[-1].result is None and calls[-1].arguments["self"]._optimized.library.is_optimized
     assert found.result == udk.Result.successful and found.stats["steps"] > 10
@@ -64,7 +64,7 @@ def test_a_limit_of_the_user_stays_one(calls):
 
 
 def test_what_is_called_often_is_optimized(calls, monkeypatch):
-    monkeypatch.setattr(primitive, "QUICK_SECONDS_OF_LINE", 1e-12)  # of which the first call takes more
+    monkeypatch.setattr(loaded_code, "QUICK_SECONDS_OF_LINE", 1e-12)  # of which the first call takes more
     mechanism = udk.library.four_bar()
     first = udk.simulate(mechanism, TS)
     count = len(calls)

@@ -18,7 +18,7 @@ import udkjax as udk
 from tests.integrate.systems.test_own_methods import BenIsrael, Together
 from tests.native.gpu import ptx_as_c
 from tests.native.gpu.test_host_handler import ADDRESS, ERROR, STREAM, Card
-from udkjax.native import primitive, records
+from udkjax.native import loaded_code, primitive, records
 from udkjax.native.code import processor
 from udkjax.native.gpu import launch, launch_handler, target
 from udkjax.native.gpu.driver import CudaError
@@ -190,7 +190,7 @@ def card(monkeypatch):
         monkeypatch.setattr(launch, name, value)
     monkeypatch.setattr(launch_handler, "BLOCK", 4)
     monkeypatch.setattr(processor, "lanes", lambda: VECTOR)
-    monkeypatch.setattr(primitive.LoadedCode, "name_on_card", primitive.LoadedCode.name)
+    monkeypatch.setattr(loaded_code.LoadedCode, "name_on_card", loaded_code.LoadedCode.name)
     mlir.register_lowering(primitive.native_p, mlir.lower_fun(primitive._lower_for_card), platform="cpu")
     _forget()
     yield card
@@ -199,7 +199,7 @@ def card(monkeypatch):
 
 
 def _forget():
-    for cache in (launch._load, primitive.generate, primitive.machine_code):
+    for cache in (launch._load, loaded_code.generate, loaded_code.machine_code):
         cache.cache_clear()
     jax.clear_caches()
 

@@ -9,8 +9,7 @@ from tests.calls import calls_of
 from tests.choices import fast
 from tests.wasm_host import Host, run_without_contraction
 from udkjax.equations import analyse
-from udkjax.integrate import native_engine
-from udkjax.native import position_operations, primitive, runs
+from udkjax.native import loaded_code, position_operations, runs
 from udkjax.native.wasm import wasm_module
 from udkjax.positions.assembling import native_closing
 
@@ -28,7 +27,7 @@ def both(operation, inputs, times):
 
 def first_call(run):
     """The result of a run, and the operation and the inputs of its machine code."""
-    with calls_of(primitive.call_concrete) as calls:
+    with calls_of(loaded_code.call_concrete) as calls:
         found = run()
     given = next(call.arguments for call in calls if isinstance(call.arguments["operation"], runs.RunStates))
     return found, (given["operation"], given["inputs"], given["times"])
@@ -54,7 +53,7 @@ def test_a_run_up_to_where_a_condition_crosses_zero(name):
     k = int(np.argmax(np.ptp(path, axis=0)))
     middle, coordinate = float(path[:, k].min() + path[:, k].max()) / 2, ("x", "y", "angle")[k]
     event = udk.Event(lambda t, at: getattr(at[body], coordinate) - middle, udk.Stop())
-    with calls_of(primitive.call_members) as calls:
+    with calls_of(loaded_code.call_members) as calls:
         events = udk.simulate(mechanism, ts, events=[event]).events
     given = [call.arguments for call in calls if isinstance(call.arguments["operation"], runs.RunWatched)][-1]
     operation, inputs, times = given["operation"], given["inputs"], given["times"]
@@ -93,7 +92,7 @@ def test_a_scene_that_runs_by_loops():
 
 
 def test_marching():
-    with calls_of(primitive.MemberCalls.of_one) as calls:
+    with calls_of(loaded_code.MemberCalls.of_one) as calls:
         udk.kinematics(udk.library.slider_crank(), "motor", np.linspace(0.0, 1.0, 21))
     given = calls[0].arguments
     operation, inputs, times = given["self"]._operation, given["inputs"], given["times"]
@@ -105,9 +104,9 @@ def test_marching():
 
 
 @pytest.mark.slow
-def test_forward_tangents(monkeypatch):
+def test_forward_tangents():
     mechanism = udk.library.parallelogram()
-    run, inputs, times = concrete_call(monkeypatch, native_engine, lambda: udk.simulate(mechanism, TIMES))
+    _, (run, inputs, times) = first_call(lambda: udk.simulate(mechanism, TIMES))
     n, count = run.code.coordinate_count, run.code.number_count
     operation = run.with_tangents((True,) * count)
     along = np.zeros((1, 1, count))

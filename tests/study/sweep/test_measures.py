@@ -10,7 +10,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax as udk
-from udkjax.native.primitive import FEW
+from udkjax.native.loaded_code import FEW
 from udkjax.study.accuracy import exact_coordinates
 from udkjax.study.sweep.measures import RANK_NOT_REACHED, guess_label, measures_of
 

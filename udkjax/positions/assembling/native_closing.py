@@ -12,9 +12,10 @@ from jaxtyping import Array, ArrayLike
 from udkjax.equations.programs.scales import Scales
 from udkjax.equations.programs.scene_programs import scene_programs
 from udkjax.equations.terms.structure import numbers_as_vector
+from udkjax.native.loaded_code import call_concrete
 from udkjax.native.packing import ActiveNumbers
 from udkjax.native.position_operations import Close
-from udkjax.native.primitive import call_concrete, native_p
+from udkjax.native.primitive import native_p
 from udkjax.native.unsupported import unsupported
 from udkjax.scene.mechanism import Mechanism
 

@@ -13,8 +13,9 @@ from jaxtyping import Array, Float, Int, PyTree
 from udkjax.annotations import NumberLike, NumericArray
 from udkjax.equations.programs.scene_programs import scene_programs
 from udkjax.equations.rows.analysis import Analysis
+from udkjax.native.loaded_code import MemberCalls
 from udkjax.native.position_operations import March
-from udkjax.native.primitive import MemberCalls, native_p
+from udkjax.native.primitive import native_p
 from udkjax.native.unsupported import unsupported
 from udkjax.programs.identity_cache import cached_by_identity
 from udkjax.scene.elements.held import row_size, with_row

@@ -13,7 +13,7 @@ from scipy.integrate import solve_ivp
 import udkjax as udk
 from tests.calls import calls_of
 from tests.friction import G, pendulum
-from udkjax.native.primitive import PreparedCall
+from udkjax.native.loaded_code import PreparedCall
 
 TOL: dict[str, Any] = {"rtol": 1e-11, "atol": 1e-11}
 STICKS: Any = {"law": "set-valued"}

@@ -21,8 +21,8 @@ from udkjax.integrate.events.run.added_joints import AddedJoint, places_of_joint
 from udkjax.integrate.events.run.passed_events import NumberPlaces, PassedEvents, passed_events
 from udkjax.integrate.native_engine import integrator_output, run_inputs
 from udkjax.integrate.problem import IntegratorOutput, Problem
+from udkjax.native.loaded_code import MemberCalls
 from udkjax.native.operations import EvaluateEvents, MarkRows, StateOperation
-from udkjax.native.primitive import MemberCalls
 from udkjax.native.runs import RunWatched
 from udkjax.native.watching.conditions import Conditions
 

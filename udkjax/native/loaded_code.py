@@ -1,0 +1,272 @@
+"""Machine code of operations: compiled once per operation, and called directly on concrete numbers."""
+
+import ctypes
+import math
+import time
+import weakref
+import zlib
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, wait
+from functools import cached_property, lru_cache, partial
+from threading import Lock
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from udkjax.native import records
+from udkjax.native.code import interrupts, machine, processor
+from udkjax.native.gpu import host_handler
+from udkjax.native.host.ffi import handler
+from udkjax.native.language.text import text_of_module
+from udkjax.native.module.layout import INFO, INPUTS, OUTPUTS
+from udkjax.native.module.loading import Code, load
+from udkjax.native.module.memory import Memory
+from udkjax.native.module.steps import Status
+from udkjax.native.operations import Operation
+from udkjax.native.runs import RunCotangents, goes_back
+from udkjax.native.shared_loads import call_by_rows
+from udkjax.programs.identity_cache import cached_by_size
+from udkjax.threads import shared_threads, thread_count
+
+CODE_BYTES = 1.4  # memory of loaded code, with the programs of its scene, for each character of the text
+QUICK_MEMBERS = 16  # maximum number of members of a call by quickly compiled code
+QUICK_STEPS = 4_000  # maximum number of steps of all its members, 20 ms
+QUICK_SECONDS_OF_LINE = 2e-6  # total time of such calls per line of text: a tenth of its compile time
+TIMES, BREAKS = INPUTS.index("ts"), INPUTS.index("breaks")
+FEW = 2  # maximum number of members that run one after another: eight lanes take as long as two members
+
+
+@lru_cache(maxsize=1)  # a module takes ten times as much memory as its code
+def generate(operation: Operation, width: int, tangent_lanes: int) -> Memory:
+    """Write the module of an operation in `width` lanes; raise `UnsupportedError` if machine code does not support it.
+
+    `tangent_lanes` is the number of directions of a single member in the lanes of a tangent.
+    """
+    module = operation.module(width, tangent_lanes, processor.lanes())
+    handlers = handler(module, "call_frame")
+    module.written_text = f"{module.text()}\n{text_of_module(handlers)}"
+    return module
+
+
+class PreparedCall(NamedTuple):
+    """A call of machine code: its record, with the arrays that it points to."""
+
+    run: Callable[[int], Any]
+    record: ctypes.Array
+    shared: ctypes.Array  # the index of the next member, and whether memory was refused
+    threads: int
+    inputs: list[np.ndarray]  # float64, contiguous in memory
+    outputs: list[np.ndarray]
+
+    def __call__(self) -> list[np.ndarray]:
+        """Return the outputs, which the next call overwrites; raise `MemoryError` if there is no memory for the computation."""
+        self.shared[:], address = (0, 0), ctypes.addressof(self.record)
+        interrupts.handler().install()
+        others = [shared_threads().submit(self.run, address) for _ in range(self.threads - 1)]
+        try:
+            self.run(address)
+        finally:
+            if others:
+                _wait_for(others)  # they write to the arrays
+        if self.shared[1]:
+            raise MemoryError("no memory for a computation by machine code")
+        return self.outputs
+
+
+def _wait_for(calls: Sequence[Future[Any]]) -> None:
+    """Wait for calls of machine code, even if interrupted meanwhile; raise their error, or the interruption."""
+    interruption: BaseException | None = None
+    for call in calls:
+        while not call.done():
+            try:
+                wait([call])
+            except KeyboardInterrupt as error:  # machine code ends, too
+                interruption = error
+    if interruption is not None:
+        raise interruption
+    for call in calls:
+        call.result()
+
+
+class LoadedCode:
+    """The machine code of one operation in `width` lanes.
+
+    If members leave for the module of a later operation, its code is loaded at the same level of optimization, and from then on
+    called directly.
+
+    First calls use quickly compiled code, which runs slowly: only calls with few members and steps, and only until they have
+    taken a tenth of the time of compiling optimized code. Both codes round equally.
+    """
+
+    def __init__(self, operation: Operation, width: int, tangent_lanes: int):
+        module = generate(operation, width, tangent_lanes)
+        self._operation, self._lanes = operation, (width, tangent_lanes)
+        self._later: LoadedCode | None = None  # the code of the later operation, once a run has needed it
+        self._packed_text, self._directions_in = zlib.compress((text := module.written_text).encode(), 1), module.directions_in
+        self._field_count, self._share = len(module.call_fields), operation.share
+        self._step_limit = {name: k for k, name in enumerate(operation.all_settings)}.get("max_steps")
+        self._seconds = QUICK_SECONDS_OF_LINE * text.count("\n") if operation.code.is_small else 0.0
+        names = (*INPUTS, *module.inputs, *module.results, *module.outputs)
+        self._lengths = [names.index(name) for name in module.lengths]
+        self.size = round(CODE_BYTES * len(text))  # an estimate of its memory, with that of the scene's programs
+
+    def _load(self, level: int) -> Code:
+        later = self._operation.later
+        load_later = None if later is None else partial(_load_later, weakref.ref(self), later, self._lanes, level)
+        return load(zlib.decompress(self._packed_text).decode(), level, load_later)
+
+    @property
+    def name(self) -> str:
+        """The name of the FFI target in XLA, in programs of the CPU."""
+        return (self._later or self).code(machine.LEVEL).name
+
+    @property
+    def name_on_card(self) -> str:
+        """The name of the FFI target in programs of a graphics card, which the host computes for it.
+
+        The driver calls it from threads of its own, which should not wait for Python: all its code is loaded here.
+        """
+        if self._operation.later:
+            return LoadedCode(self._operation.later, *self._lanes).name_on_card
+        return host_handler.register(self.name, self._optimized.library["call_frame"])
+
+    def code(self, level: int) -> Code:
+        """Return the code of a level of optimization, compiled at its first use."""
+        return self._optimized if level == machine.LEVEL else self._quick
+
+    @cached_property
+    def _optimized(self) -> Code:
+        self._seconds = 0.0
+        return self._load(machine.LEVEL)
+
+    @cached_property
+    def _quick(self) -> Code:
+        return self._load(machine.QUICK)
+
+    def __call__(self, inputs: Sequence[np.ndarray], shapes: Sequence[tuple[int, ...]]) -> list[np.ndarray]:
+        """Return outputs of these shapes, computed by `thread_count` threads, or fewer if there are few members."""
+        if self._later:
+            return self._later(inputs, shapes)
+        if self._seconds > 0.0 and shapes[0][0] <= QUICK_MEMBERS and self.is_quick(inputs):
+            outputs = self._call_quickly(inputs, shapes)
+            if outputs is not None:
+                return outputs
+        return (self._later or self).prepare(inputs, shapes)()
+
+    def is_quick(self, inputs: Sequence[np.ndarray]) -> bool:
+        """Return whether quickly compiled code runs a call with few members.
+
+        It needs a limit of steps, which reverse mode cannot meet where it integrates again.
+        """
+        if self._seconds <= 0.0 or self._quick.library.is_optimized:
+            return False
+        return not isinstance(self._operation, RunCotangents) or not goes_back(inputs) or records.are_given(inputs)
+
+    def _call_quickly(self, inputs: Sequence[np.ndarray], shapes: Sequence[tuple[int, ...]]) -> list[np.ndarray] | None:
+        """Return the outputs, computed by quickly compiled code; None if a run exceeds its share of `QUICK_STEPS` steps."""
+        inputs, allowed, column = [*inputs], QUICK_STEPS / shapes[0][0], self._step_limit
+        if column is not None:
+            k = INPUTS.index("settings")
+            settings = inputs[k] = np.array(inputs[k], np.float64)
+            is_limited = settings[:, column] > allowed
+            settings[is_limited, column] = allowed
+        start = time.perf_counter()
+        outputs = self.prepare(inputs, shapes, self._quick)()
+        self._seconds -= time.perf_counter() - start
+        if column is not None:
+            info = outputs[OUTPUTS.index("info")]
+            if info.size and np.any(is_limited & (info[:, INFO.index("code")] == Status.STEP_LIMIT)):
+                self._seconds = 0.0
+                return None
+        return outputs
+
+    def prepare(self, inputs: Sequence[np.ndarray], shapes: Sequence[tuple[int, ...]], code: Code | None = None) -> PreparedCall:
+        """Return a call that can be repeated with other numbers in `inputs`, which are the given arrays if these are float64."""
+        code, inputs = code or self._optimized, [np.ascontiguousarray(x, np.float64) for x in inputs]
+        outputs = [np.full(shape, np.nan) for shape in shapes]
+        members, times, knots = shapes[0][0], inputs[TIMES].shape[1], inputs[BREAKS].shape[1]
+        arrays, following = (*inputs, *outputs), (ctypes.c_int64 * 2)()
+        record = (  # the fields in the order of `Memory.call_fields`
+            *(members, times, knots, inputs[-1].shape[self._directions_in]),
+            *(x.__array_interface__["data"][0] for x in inputs),
+            *(x.size // len(x) if len(x) > 1 else 0 for x in inputs),
+            *(x.__array_interface__["data"][0] for x in outputs),
+            *(arrays[k].shape[1] for k in self._lengths),
+            ctypes.addressof(following),
+        )
+        assert len(record) == self._field_count
+        call = (ctypes.c_int64 * len(record))(*record)
+        shares = members // self._share
+        threads = 1 if shares <= 1 else min(shares, thread_count())
+        return PreparedCall(code.run, call, following, threads, inputs, outputs)
+
+
+def _load_later(owner: Callable[[], LoadedCode | None], operation: Operation, lanes: tuple[int, int], level: int) -> Code:
+    """Return the code of the later operation, which its owner calls from then on."""
+    later, loaded = LoadedCode(operation, *lanes), owner()
+    if loaded is not None:
+        loaded._later = later
+    return later.code(level)
+
+
+@cached_by_size(lambda code: code.size)
+def machine_code(operation: Operation, width: int, tangent_lanes: int) -> LoadedCode:
+    """Return the machine code of an operation."""
+    return LoadedCode(operation.first, width, tangent_lanes)
+
+
+def call_concrete(operation: Operation, inputs: Sequence[np.ndarray], times: int) -> list[np.ndarray]:
+    """Run an operation on concrete numbers of one member, without tracing."""
+    if operation.code.shares_by_marks:
+        return call_by_rows(call_members, inputs, operation, times)
+    return machine_code(operation, 1, 1)(inputs, operation.shapes(inputs, times))
+
+
+def select_code(inputs: Sequence[Any], operation: Operation) -> LoadedCode:
+    """Return the code for the members and directions of these inputs: in lanes, or one after another if they are few."""
+    one_by_one = not operation.in_lanes or max(x.shape[0] for x in inputs) <= FEW
+    directions = inputs[-1].shape[1] if operation.tangents and one_by_one and operation.code.is_small else 1
+    tangent_lanes = min(2 ** math.ceil(math.log2(directions)), processor.lanes())  # shorter registers are faster
+    return machine_code(operation, 1 if one_by_one else processor.lanes(), tangent_lanes)
+
+
+def call_members(*inputs: np.ndarray, operation: Operation, times: int) -> list[np.ndarray]:
+    """Run an operation on concrete numbers of any number of members."""
+    if operation.code.shares_by_marks:
+        return call_by_rows(call_members, inputs, operation, times)
+    return select_code(inputs, operation)(inputs, operation.shapes(inputs, times))
+
+
+class MemberCalls:
+    """Calls of one operation on concrete numbers of any number of members."""
+
+    def __init__(self, operation: Operation):
+        self._operation, self._shapes, self._lock = operation, (), Lock()
+        self._prepared: PreparedCall | None = None
+
+    def __call__(self, *inputs: np.ndarray, times: int) -> list[np.ndarray]:
+        """Return the outputs."""
+        return call_members(*inputs, operation=self._operation, times=times)
+
+    def of_one(self, *inputs: np.ndarray, times: int) -> list[np.ndarray]:
+        """Return the outputs of an operation as for `at_states`, for one member at some times."""
+        with self._lock:
+            return [x.copy() for x in self.at_states(*inputs, times=times)]
+
+    def at_states(self, *inputs: np.ndarray, times: int = 2) -> list[np.ndarray]:
+        """Return the outputs, which the next call overwrites; arrays of the same shapes as in the last call are prepared already.
+
+        The operation writes all of its outputs, as one at single states does, and has no later operation.
+        """
+        if self._operation.code.shares_by_marks:
+            return self(*inputs, times=times)
+        shapes = tuple([x.shape for x in inputs])
+        if self._prepared is not None and shapes == self._shapes:
+            for own, x in zip(self._prepared.inputs, inputs, strict=True):
+                own[...] = x
+            return self._prepared()
+        code, results = select_code(inputs, self._operation), self._operation.shapes(inputs, times)
+        if results[0][0] <= QUICK_MEMBERS and code.is_quick(inputs):
+            return code(inputs, results)
+        self._prepared, self._shapes = code.prepare([np.array(x, float) for x in inputs], results), shapes
+        return self._prepared()
