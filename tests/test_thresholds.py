@@ -291,7 +291,7 @@ CASES: dict[str, tuple[Callable[[], dict[str, Any]], tuple[str, ...], float]] = 
     "HIDES": (hidden_numbers, ("study.tolerancing.dimensions.HIDES",), 0.0),
     **{
         name: (least_gaps, (f"positions.gaps.{name}",), 1e-9)
-        for name in ("search.PROVEN", "search.OPENED", "search.BESIDE", "search.LAST_STEP", "motion.FOLLOWED")
+        for name in ("search.PROVEN", "search.OPENED", "search.BESIDE", "search.LAST_STEP", "search.STEEP", "motion.FOLLOWED")
     },
     "KEEPS_SIDE": (followed_turns, ("native.closing.marching.KEEPS_SIDE",), 1e-8),
     "CLEARLY_ALONG": (linearized_rests, ("statics.linearization.CLEARLY_ALONG",), 1e-9),

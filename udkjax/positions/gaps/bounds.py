@@ -80,8 +80,7 @@ def least_of_cubics(f: Moving, h: Any) -> tuple[Any, Any]:
     c2, c3 = 3 * (f1 - f0) - 2 * d0 - d1, 2 * (f0 - f1) + d0 + d1
     root = np.sqrt(np.maximum(c2 * c2 - 3 * c3 * d0, 0.0))
     over, under = np.where(c2 >= 0, -d0, root - c2), np.where(c2 >= 0, c2 + root, 3 * c3)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        t = np.nan_to_num(np.clip(over / under, 0.0, 1.0))
+    t = np.minimum(np.maximum(over / np.where(under > 0, under, np.inf), 0.0), 1.0)
     return np.minimum(np.minimum(f0, f1), f0 + t * (d0 + t * (c2 + t * c3))), t
 
 
@@ -125,15 +124,16 @@ def _bounds_by_corners(
     """Return lower bounds over the intervals k by the closest corners of both parts, and where these are closest."""
     relative, h = relative[:, k], h[k]
     share, a, b = h**4 / 384, A.corners.one(corner_a, k), B.corners.one(corner_b, k)
-    r = b - a
-    square, t = least_of_cubics(r.dot(r), h)
-    square -= _fourth_of_product(relative, relative) * share
+    r, count, every = b - a, len(A.corners.at), np.arange(len(k))
+    ways = a - A.corners.take(k), B.corners.take(k) - b
+    vectors = Moving(*(np.concatenate([x[None], y, z]) for x, y, z in zip(r, *ways, strict=True)))
+    least, at = least_of_cubics(vectors.dot(r), h)
+    square = least[0] - _fourth_of_product(relative, relative) * share
     beside = np.zeros(len(k))
-    for part, corner, ways in ((A, corner_a, a - A.corners.take(k)), (B, corner_b, B.corners.take(k) - b)):
-        if len(ways.at) > 1:
-            of_ways = 2 * part.reach[k] * part.directions[:, k]
-            least = least_of_cubics(ways.dot(r), h)[0] - _fourth_of_product(of_ways, relative) * share
-            least[corner, np.arange(len(k))] = 0.0
-            beside += least.min(0)
+    for part, corner, products in ((A, corner_a, least[1 : 1 + count]), (B, corner_b, least[1 + count :])):
+        if len(products) > 1:
+            products = products - _fourth_of_product(2 * part.reach[k] * part.directions[:, k], relative) * share
+            products[corner, every] = 0.0
+            beside += products.min(0)
     distance = np.sqrt(np.where(square > 0, square, np.inf))
-    return np.where(square > 0, distance + beside / distance, -np.inf), t
+    return np.where(square > 0, distance + beside / distance, -np.inf), at[0]

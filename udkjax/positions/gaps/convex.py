@@ -94,7 +94,7 @@ class _CornerPlaces(NamedTuple):
 
 def _corner_places(points: Corners, corners: Corners) -> _CornerPlaces:
     start = corners if len(corners) > 2 else corners[:1]
-    way = np.concatenate([corners[1:], corners[:1]])[: len(start)] - start
+    way = (np.concatenate([corners[1:], corners[:1]]) if len(corners) > 2 else corners[-1:]) - start
     length = np.sqrt(way[:, 0] * way[:, 0] + way[:, 1] * way[:, 1])
     safe = np.maximum(length, np.finfo(float).tiny)
     ex, ey = way[:, 0] / safe, way[:, 1] / safe

@@ -49,7 +49,8 @@ PAIRS = ArgumentRequirement("pairs of names", _require_pairs)
 
 
 def _is_pair(x: Any) -> bool:
-    return isinstance(x, Sequence) and not isinstance(x, str) and len(x) == 2 and all(isinstance(name, str) for name in x)
+    is_sequence = isinstance(x, tuple | list) or (isinstance(x, Sequence) and not isinstance(x, str))
+    return is_sequence and len(x) == 2 and isinstance(x[0], str) and isinstance(x[1], str)
 
 
 @prints_table

@@ -104,11 +104,9 @@ class PartPairs(NamedTuple):
         """Return the closest places of the pairs k in poses (3, n) of both bodies, given with their rates."""
         corners, near = self.closest(k, [PlacedFrames.of(q) for q, _ in poses])
         found, every = near.features(self.counts, slice(None)), np.arange(len(k))
-        places = np.empty((2, 2, len(k)))
-        for own, other, x, mask, way in ((0, 1, corners[0], found.of_a, near.n), (1, 0, corners[1], ~found.of_a, -near.n)):
-            i = np.flatnonzero(mask)
-            places[own][:, i] = place = x[found.corner[i], :, every[i]].T
-            places[other][:, i] = place + near.distance[i] * way[:, i]
+        A, B = (x[np.minimum(found.corner, len(x) - 1), :, every].T for x in corners)
+        way = near.distance * near.n
+        places = np.where(found.of_a, [A, A + way], [B - way, B])
         rates = [
             near.n[0] * (v[0] - v[2] * (here[1] - q[1])) + near.n[1] * (v[1] + v[2] * (here[0] - q[0]))
             for (q, v), here in zip(poses, places, strict=True)

@@ -25,10 +25,11 @@ OPENED = 1e-6  # of the size: smaller openings within a stretch of contact may b
 SPLITS = 4  # parts into which an interval is split
 BLOCK = SPLITS**2  # polynomials of a motion in the first intervals
 MOST_INTERVALS = 100_000  # at a time; beyond that, the bound that is proven is returned
-POINTS = 1024  # at a time: their arrays stay in the processor's cache
+NUMBERS = 20_000  # of arrays, at most: pairs of corners at so many places are measured at a time
 BESIDE = 1e-6  # of a piece, from a least gap: where both sides of a kink are seen
 MOST_STEPS = 100  # to a root
 LAST_STEP = 1e-12  # to it, of a piece
+STEEP = 1e-2  # of the values at the ends: a smaller one, not at a jump, allows a last step 1 / STEEP as long
 Stretches = list[tuple[float, float]]
 
 
@@ -99,7 +100,7 @@ class PairSearch:
         bodies, count = np.unique(pairs.bodies), len(pairs.owner)
         extent = (motion.highest[:, bodies].max(1) - motion.lowest[:, bodies].min(1)).max()
         self.size = float(extent) + float(self.reach.max()) + float(self.radius.max())
-        self.rounding = ROUNDING * self.size
+        self.rounding, self.points = ROUNDING * self.size, NUMBERS // (pairs.counts[0] * pairs.counts[1])
         self.least, self.low = np.full((2, count), np.inf)
         self.s, self.step = np.zeros((2, count))
         self.crossings: list[np.ndarray] = []  # pairs, places s0 and s1, gaps there
@@ -120,7 +121,7 @@ class PairSearch:
         left, step = self._first_intervals(least), float(BLOCK)
         while 0 < len(left.k) <= MOST_INTERVALS:
             step /= SPLITS
-            rows, found = POINTS // (SPLITS + 1), []
+            rows, found = max(1, self.points // (SPLITS + 1)), []
             for first in range(0, len(left.k), rows):
                 k, s0, s1 = (x[first : first + rows, None] for x in left[:3])
                 s = np.minimum(s0 + step * np.arange(SPLITS + 1), s1).ravel()
@@ -142,7 +143,7 @@ class PairSearch:
         bodies, rows = np.unique(self.pairs.bodies, return_inverse=True)
         frames = PlacedFrames.of(motion.poses(np.repeat(bodies, len(s)), np.tile(s, len(bodies)))[0])
         rows, found, touching = rows.reshape(2, -1), [], []
-        size = max(1, POINTS // len(s))
+        size = max(1, self.points // len(s))
         for start in range(0, count, size):
             some = np.arange(start, min(start + size, count))
             at = ((rows[:, some] * len(s))[..., None] + np.arange(len(s))).reshape(2, -1)
@@ -311,7 +312,7 @@ def _roots(
     Source: N. Anderson and A. Bjorck, A new high order method of regula falsi type, BIT 13 (1973).
     """
     (a, b), (fa, fb), i = np.array([low, high]), np.array([f_low, f_high]), np.arange(len(low))
-    place = guess
+    place, steep = guess, STEEP * np.maximum(np.abs(f_low), np.abs(f_high))
     for _ in range(MOST_STEPS):
         if not len(i):
             break
@@ -323,7 +324,7 @@ def _roots(
         a[i], fa[i] = np.where(passed, near, far), np.where(passed, f_near, f_far * np.where(share > 0, share, 0.5))
         b[i], fb[i] = place, value
         step = np.minimum(np.abs(place - near), np.abs(place - a[i]))
-        i = i[(value != 0) & (step > LAST_STEP)]
+        i = i[(value != 0) & (step > np.where(np.abs(value) > steep[i], LAST_STEP, LAST_STEP / STEEP))]
         place = b[i] - fb[i] * (b[i] - a[i]) / (fb[i] - fa[i])
     return b
 
