@@ -18,7 +18,7 @@ from udkjax.equations.states.textbook import TextbookEquations
 from udkjax.equations.terms.elements import has_pieces
 from udkjax.integrate.projection import Projection
 from udkjax.integrate.solvers import has_method, is_explicit, method_of
-from udkjax.integrate.stabilization import Stabilization
+from udkjax.integrate.stabilization import Stabilization, overridden
 from udkjax.native.language.program import UnsupportedError
 from udkjax.native.operations import Accelerate
 from udkjax.native.packing import SampleRows
@@ -52,6 +52,11 @@ class RunPlan:
     def is_native(self) -> bool:
         """True if machine code integrates."""
         return not self.why_not_native
+
+    @property
+    def differentiates(self) -> bool:
+        """True if machine code has derivatives of the run: diffrax has those through a stabilization of the user's."""
+        return self.is_native and self.operation is not None and self.operation.stabilization is None
 
     @cached_property
     def has_timed_pieces(self) -> bool:
@@ -122,20 +127,23 @@ def compile_mechanism(
     equations = equations_of(system, method, baumgarte, formulation, analysis)
     projects = isinstance(stabilization, Projection) or equations.solves_constraints
     projected, breakpoints = equations.constrained and projects, system.breakpoints
+    own = stabilization if isinstance(stabilization, Stabilization) else None
     operation, evaluation, rows, most_rank = None, None, 0, 0
     if engine in ("diffrax", "jax"):
         why = "it was asked for"
-    elif isinstance(stabilization, Stabilization):
-        why = f"it does not know {type(stabilization).__name__}"
     else:
         why = _reason_for_diffrax(equations, solver, adjoint, meter, stepper)
+        if own is not None and not why:
+            why = _reason_for_stabilization(equations, solver, own)
     if not why:
         operation = _run_operation(equations, solver, projected, breakpoints)
         textbook = equations.textbook
         most_rank = len(textbook.scales.rows) - len(textbook.redundant or ())
         rows = most_rank if eliminates(textbook.method) else len(textbook.scales.rows)
         why = _reason_for_programs(operation)
-    elif engine != "jax":
+        if own is not None and not why:
+            operation, why = _stabilized(operation, own)
+    if engine != "jax" and (why or own is not None):
         evaluation = evaluation_of(equations)
     if engine == "native" and why:
         raise ValueError(f'engine="native" cannot: {why}. engine="auto" uses diffrax instead')
@@ -187,6 +195,22 @@ def _reason_for_diffrax(
     if equations.solves_constraints and rolling_joints(getattr(equations.textbook, "mechanism", None)):
         return "it does not partition the coordinates of mechanisms with rolling joints"
     return _reason_for_equations(equations)
+
+
+def _reason_for_stabilization(equations: AbstractSystem, solver: Any, stabilization: Stabilization) -> str:
+    """Return why machine code cannot integrate equations with any user-defined stabilization; empty if it can."""
+    name = type(stabilization).__name__
+    if equations.solves_constraints:
+        return f"it partitions coordinates without {name}"
+    return "" if is_explicit(solver) else f"it knows {name} with explicit methods only, and {type(solver).__name__} is implicit"
+
+
+def _stabilized(operation: RunStates, stabilization: Stabilization) -> tuple[RunStates, str]:
+    """Return an operation with a user-defined stabilization, or why it has no machine code."""
+    try:
+        return operation.stabilized(stabilization, overridden(stabilization)), ""
+    except UnsupportedError as unknown:
+        return operation, f"it does not know {unknown}"
 
 
 def _reason_for_equations(equations: AbstractSystem) -> str:

@@ -103,7 +103,8 @@ class DifferentiableRun(DifferentiableFunction):
 
     @property
     def orders(self) -> int:
-        operation = self.problem.rest.compiled.plan.operation if self.native else None
+        plan = self.problem.rest.compiled.plan
+        operation = plan.operation if self.native and plan.differentiates else None
         return 0 if operation is None else 1 if operation.sampled else 2
 
     def fast(self, inputs: list[Array]) -> IntegratorOutput:
@@ -182,7 +183,8 @@ class DifferentiableRun(DifferentiableFunction):
         return self.fast(inputs) if operation is not None and operation.closes else raw
 
     def _is_native(self, inputs: list[Array], active: Mask) -> bool:
-        return self.native and native_engine.serves_derivatives(self.problem.marks(active))
+        is_able = self.native and self.problem.rest.compiled.plan.differentiates
+        return is_able and native_engine.serves_derivatives(self.problem.marks(active))
 
     def __call__(self, inputs: list[Array]) -> list[Array]:
         raw = integrate_by_diffrax(self.problem(inputs))

@@ -162,6 +162,8 @@ def run_inputs(problem: Problem, operation: RunStates, xp: ModuleType = jnp) -> 
         "most_rank": xp.where(xp.isinf(problem.drift_tol), np.inf, float(compiled.plan.most_rank)),
         "open_tol": xp.maximum(problem.drift_tol, scene.thresholds[1]),
     }
+    if operation.stabilization is not None:
+        settings |= operation.stabilization.settings_of(problem.stabilization, compiled.textbook.scales.rank_tol)
     numbers = [*scene.numbers, *([] if problem.marks is None else [problem.marks]), *scene.thresholds]
     return operation.pack(numbers, problem.ts, problem.q, problem.v, settings, scene.rows, scene.breaks, xp, scene.samples)
 

@@ -70,19 +70,21 @@ class Choices(NamedTuple):
     @property
     def take_diffrax(self) -> bool:
         """True if diffrax integrates every mechanism with these choices."""
-        return self.engine in ("diffrax", "jax") or not has_method(self.solver) or bool(self.without_events)
+        return self.engine in ("diffrax", "jax") or not has_method(self.solver) or bool(self._of_diffrax)
 
     @property
-    def only_by_diffrax(self) -> str:
-        """The user-defined argument that excludes machine code and events; empty without any."""
-        own = "a stabilization of your own" if isinstance(self.stabilization, Stabilization) else ""
-        return "a step size controller" if self.stepper is not None else own
+    def _of_diffrax(self) -> str:
+        """The argument that only diffrax takes; empty without any."""
+        if self.stepper is not None:
+            return "a step size controller"
+        meter = "" if self.meter is None else "a progress meter"
+        return meter if self.adjoint is None else "a diffrax adjoint"
 
     @property
     def without_events(self) -> str:
         """The argument with which a run cannot locate events, kinks and stick-slip; empty without any."""
-        meter = "" if self.meter is None else "a progress meter"
-        return self.only_by_diffrax or (meter if self.adjoint is None else "a diffrax adjoint")
+        own = "a stabilization of your own" if isinstance(self.stabilization, Stabilization) else ""
+        return self._of_diffrax or own
 
     @property
     def integrator(self) -> str:

@@ -4,19 +4,17 @@ A `Stabilization` receives a `ConstraintState`: a state within a step, its resid
 changes, in the metric of M, that remove given residuals to first order.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from udkjax.annotations import Time, Vector
 from udkjax.argument_types import checks_instances, require_thresholds
-from udkjax.equations.laws.abstract_system import AbstractSystem, TangentPart
+from udkjax.equations.laws.abstract_system import TangentPart
 from udkjax.equations.laws.formulations import WrappedSystem
-from udkjax.equations.terms.scale_program import RANK_TOL
-from udkjax.pinv import SVD
 from udkjax.printing import PrintsLine
 
 
@@ -35,7 +33,7 @@ class ConstraintState(eqx.Module):
     q: Float[Array, "n"]
     v: Float[Array, "n"]
     h: Float[Array, ""]
-    equations: AbstractSystem
+    equations: Any
 
     @property
     def psi(self) -> Float[Array, "m"]:
@@ -55,7 +53,7 @@ class ConstraintState(eqx.Module):
     @property
     def mass(self) -> Float[Array, "n n"]:
         """The mass matrix M (n, n)."""
-        return self.equations.matrices(self.t, self.q, self.v)[0]
+        return self.equations.mass(self.t, self.q, self.v)
 
     def moved(self, q: Vector, v: Vector) -> "ConstraintState":
         """Return another state at the same time."""
@@ -63,23 +61,11 @@ class ConstraintState(eqx.Module):
 
     def change_of_positions(self, residual: Float[Array, "m"]) -> Vector:
         """Return the least change w (n,) in the metric of M with Psi_q w = residual: M^(-1/2) D^+ residual."""
-        return self._least_change(residual, len(self.psi))
+        return self.equations.least_change(self.t, self.q, self.v, residual, len(self.psi))
 
     def change_of_velocities(self, residual: Float[Array, "k"]) -> Vector:
         """Return the least change w (n,) in the metric of M with A w = residual, A = Psi_q, and after it phi_v."""
-        return self._least_change(residual, None)
-
-    def _least_change(self, residual: Array, count: int | None) -> Vector:
-        M, _, A, _ = self.equations.matrices(self.t, self.q, self.v)
-        rows = A[:count]
-        if not len(rows):
-            return jnp.zeros_like(self.q)
-        scales = getattr(self.equations.textbook, "scales", None)
-        weights = jnp.ones(len(rows)) if scales is None or len(scales.rows) < len(rows) else scales.weights[: len(rows)]
-        tol = RANK_TOL if scales is None else scales.rank_tol
-        L = jnp.linalg.cholesky(M)
-        D = jax.scipy.linalg.solve_triangular(L, rows.T, lower=True).T * weights[:, None]
-        return jax.scipy.linalg.solve_triangular(L, SVD(tol).plus(D) @ (weights * residual), lower=True, trans=1)
+        return self.equations.least_change(self.t, self.q, self.v, residual, len(self.psi_dot))
 
 
 class Stabilization(PrintsLine):
@@ -87,7 +73,7 @@ class Stabilization(PrintsLine):
 
     `rates(at, v, a)` returns q' and v' that are integrated instead of v and a; `at.h` is the length of the present step, on which
     gains may depend. `end_of_step(at)` returns the state from which the next step starts. Both receive a `ConstraintState`, and
-    are written in jax.numpy, with numbers that are fields. By default neither changes anything. diffrax integrates such runs.
+    are written in jax.numpy, with numbers that are fields. By default neither changes anything.
     """
 
     def rates(self, at: ConstraintState, v: Vector, a: Vector) -> tuple[Vector, Vector]:
@@ -117,6 +103,23 @@ class Stabilization(PrintsLine):
 
 
 checks_instances(Stabilization)(require_thresholds)
+
+
+def rates(stabilization: Stabilization, t: Any, q: Any, v: Any, h: Any, a: Any, equations: Any) -> tuple[Vector, Vector]:
+    """Return q' and v' at a state of equations within a step of length h."""
+    return stabilization.rates(ConstraintState(t, q, v, h, equations), v, a)
+
+
+def end_of_step(stabilization: Stabilization, t: Any, q: Any, v: Any, h: Any, a: Any, equations: Any) -> tuple[Vector, Vector]:
+    """Return q and v after a step of length h that has led to a state of equations."""
+    del a
+    return stabilization.end_of_step(ConstraintState(t, q, v, h, equations))
+
+
+def overridden(stabilization: Stabilization) -> dict[str, Callable[..., tuple[Vector, Vector]]]:
+    """Return the methods of a stabilization that are not those of its base, as functions of numbers, by name."""
+    methods = {"rates": rates, "end_of_step": end_of_step}
+    return {x: f for x, f in methods.items() if getattr(type(stabilization), x) is not getattr(Stabilization, x)}
 
 
 class StabilizedEquations(WrappedSystem):

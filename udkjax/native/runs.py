@@ -1,6 +1,6 @@
 """The operations of machine code that integrate: a run, a run up to an event, and runs with derivatives."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, ClassVar
 
@@ -14,6 +14,7 @@ from udkjax.native.module.module import Module
 from udkjax.native.module.tableau import EULER, KVAERNO5, Method
 from udkjax.native.operations import Accelerate, Operation
 from udkjax.native.parts.formulations import FormulationCode
+from udkjax.native.parts.own_stabilization import StabilizationCode
 from udkjax.native.pseudoinverses.dense import DenseMethod
 from udkjax.native.run.trajectory import Trajectory
 from udkjax.native.watching.conditions import Conditions
@@ -33,12 +34,14 @@ class RunStates(Operation):
     formulation: FormulationCode | None = None  # None: the Udwadia-Kalaba equation
     changes: bool = False  # whether a run goes on by an implicit method, Kvaerno's, where stability limits an explicit one
     leaves: bool = False  # whether it does so by the module of `later`
+    stabilization: StabilizationCode | None = None  # the user's own
 
     info_names: ClassVar[tuple[str, ...]] = INFO  # names of the first numbers of the output "info", before the last q and v
 
     @property
     def all_settings(self) -> tuple[str, ...]:
-        return (*self.settings, *(self.formulation.settings if self.formulation else ()))
+        parts = self.formulation, self.stabilization
+        return (*self.settings, *(name for part in parts if part is not None for name in part.settings))
 
     @property
     def closes(self) -> bool:
@@ -60,7 +63,16 @@ class RunStates(Operation):
             formulation=self.formulation,
             stiff=KVAERNO5 if self.changes and not self.leaves else None,
             leaves=self.leaves,
+            stabilization=self.stabilization,
         )
+
+    def stabilized(self, stabilization: Any, methods: Mapping[str, Callable[..., Any]]) -> "RunStates":
+        """Return the operation with a user-defined stabilization, and its methods (`udkjax.integrate.stabilization`).
+
+        Raises:
+            UnsupportedError: the message says which operation has no machine code.
+        """
+        return replace(self, changes=False, stabilization=StabilizationCode.of(stabilization, methods, self.code))
 
     @property
     def first(self) -> "RunStates":

@@ -5,12 +5,15 @@ from types import SimpleNamespace
 from typing import Any, ClassVar, NamedTuple, Protocol, Self, TypeAlias
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from udkjax.annotations import Time, Vector
 from udkjax.equations.programs.run_programs import RunPrograms
+from udkjax.equations.terms.scale_program import RANK_TOL
+from udkjax.pinv import SVD
 
 
 class HasStates(Protocol):
@@ -91,6 +94,22 @@ class AbstractSystem(eqx.Module):
         self, t: Time, q: Vector, v: Vector
     ) -> tuple[Float[Array, "n n"], Vector, Float[Array, "m n"], Float[Array, "m"]]:
         """Return M, F, A and c of M a + A^T lambda = F and A a = c, with Baumgarte's terms in c."""
+
+    def mass(self, t: Time, q: Vector, v: Vector) -> Float[Array, "n n"]:
+        """Return M."""
+        return self.matrices(t, q, v)[0]
+
+    def least_change(self, t: Time, q: Vector, v: Vector, residual: Float[Array, "k"], count: int) -> Vector:
+        """Return the least change w in the metric of M with A w = residual, for the first `count` rows of A."""
+        M, _, A, _ = self.matrices(t, q, v)
+        rows, scales = A[:count], getattr(self.textbook, "scales", None)
+        if not count:
+            return jnp.zeros_like(q)
+        weights = jnp.ones(count) if scales is None or len(scales.rows) < count else scales.weights[:count]
+        L = jnp.linalg.cholesky(M)
+        D = jax.scipy.linalg.solve_triangular(L, rows.T, lower=True).T * weights[:, None]
+        plus = SVD(RANK_TOL if scales is None else scales.rank_tol).plus(D)
+        return jax.scipy.linalg.solve_triangular(L, plus @ (weights * residual), lower=True, trans=1)
 
     @abstractmethod
     def project(self, t: Time, q: Vector, v: Vector) -> tuple[Vector, Vector]:

@@ -30,10 +30,15 @@ def traced(function: Callable[..., Any], given: Sequence[jax.ShapeDtypeStruct]) 
 
 
 class LoweredFunction(Function):
-    """A function with its constant tables."""
+    """A function with its constant tables.
 
-    def __init__(self, name: str, pointers: Sequence[str], width: int):
-        super().__init__(name, [(POINTER, x) for x in pointers], width)
+    `in_module`: its arguments are the pointer `work` of a module, whose functions it calls, and the places of `pointers` there.
+    """
+
+    def __init__(self, name: str, pointers: Sequence[str], width: int, in_module: bool = False):
+        super().__init__(name, [(POINTER, "work")] * in_module + [(INT if in_module else POINTER, x) for x in pointers], width)
+        for x in pointers if in_module else ():
+            self.given[x] = self.at(self.given["work"], self.given[x])
         self.tables: list[str] = []
         self.noinline = True
 
@@ -48,9 +53,11 @@ class LoweredFunction(Function):
         return self._lines, self._reserved, self.tables, sorted(self.declared)
 
     @classmethod
-    def of_parts(cls, name: str, pointers: Sequence[str], width: int, parts: Sequence[list[str]]) -> "LoweredFunction":
-        """Return a function with the lines of another one, which calls none."""
-        f = cls(name, pointers, width)
+    def of_parts(
+        cls, name: str, pointers: Sequence[str], width: int, in_module: bool, parts: Sequence[list[str]]
+    ) -> "LoweredFunction":
+        """Return a function with the lines of another one, which evaluates none."""
+        f = cls(name, pointers, width, in_module)
         f._lines, f._reserved, f.tables, declared = parts
         f.declared = set(declared)
         return f

@@ -16,6 +16,7 @@ from udkjax.native.language.ir import DOUBLE
 from udkjax.native.language.program import UnsupportedError
 from udkjax.native.lowering.arrays import Stored
 from udkjax.native.lowering.lowering import LoweredFunction, Lowering, traced
+from udkjax.native.lowering.module_calls import simplified
 from udkjax.native.lowering.rules import lower
 from udkjax.native.lowering.source_key import source_key
 
@@ -114,6 +115,11 @@ class Written(NamedTuple):
 
     function: LoweredFunction
     size: int
+    unchanged: Sequence[int | None] = ()  # for each result, the index of the input that it is, or None
+
+    def calls(self, name: str) -> bool:
+        """Return whether the function calls a function of the module."""
+        return any(f"@{name}(" in line for line in self.function.parts[0])
 
     def within(self, size: int) -> LoweredFunction:
         """Return the function if `size` numbers of scratch memory in each lane are enough for it.
@@ -127,28 +133,31 @@ class Written(NamedTuple):
 
 
 @lru_cache(maxsize=64)
-def written(code: OwnMethod, inputs: tuple[Input, ...], width: int) -> Written:
+def written(code: OwnMethod, inputs: tuple[Input, ...], width: int, within: Any = None) -> Written:
     """Return the function `name(inputs..., scratch)` of a user's method, which writes its outputs from the start of `scratch`.
 
+    With a module that its text depends on (`within`), whose functions it may call, it is `name(work, inputs..., scratch)`, with
+    places instead of pointers.
     The text is stored on disk by the object's source, if that is known: tracing and lowering take 30 ms.
     """
-    pointers = [*(x.name for x in inputs), "scratch"]
-    key = source_key(type(code).__name__, code.own.template, inputs, width)
+    pointers, in_module = [*(x.name for x in inputs), "scratch"], within is not None
+    key = source_key(type(code).__name__, code.own.template, within, inputs, width)
     stored = None if key is None else code_cache.read(f"text-{key}")
     if stored is not None:
-        name, size, *parts = json.loads(stored)
-        return Written(LoweredFunction.of_parts(name, pointers, width, parts), size)
-    f = LoweredFunction("own", pointers, width)
-    found = Written(f, _write(f, _traced(code, tuple(x.shape for x in inputs)), inputs))
+        name, size, unchanged, *parts = json.loads(stored)
+        return Written(LoweredFunction.of_parts(name, pointers, width, in_module, parts), size, unchanged)
+    f, closed = LoweredFunction("own", pointers, width, in_module), _traced(code, tuple(x.shape for x in inputs))
+    places = {id(a): k for k, a in enumerate(closed.jaxpr.invars)}
+    found = Written(f, _write(f, closed, inputs), [places.get(id(a)) for a in closed.jaxpr.outvars])
     f.name = f"own_{hashlib.sha256(f.text().encode()).hexdigest()[:16]}"
     if key is not None and not f.evaluated:
-        code_cache.write(f"text-{key}", json.dumps((f.name, found.size, *f.parts)).encode())
+        code_cache.write(f"text-{key}", json.dumps((f.name, found.size, found.unchanged, *f.parts)).encode())
     return found
 
 
 @lru_cache(maxsize=64)
 def _traced(code: OwnMethod, shapes: tuple[tuple[int, ...], ...]) -> Any:
-    return traced(code.evaluate, [jax.ShapeDtypeStruct(shape, float) for shape in shapes])
+    return simplified(traced(code.evaluate, [jax.ShapeDtypeStruct(shape, float) for shape in shapes]))
 
 
 def _write(f: LoweredFunction, closed: Any, inputs: Sequence[Input]) -> int:

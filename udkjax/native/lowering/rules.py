@@ -18,6 +18,7 @@ from udkjax.native.lowering.decompositions import (
     tiled,
 )
 from udkjax.native.lowering.lowering import Lowering, traced
+from udkjax.native.lowering.module_calls import call_p, module_call
 from udkjax.native.lowering.reductions import argument, cumulative, dot, extreme, reduce_axes
 from udkjax.native.lowering.solving import cholesky, linear_solve, lu, triangular_solve
 from udkjax.native.lowering.updates import dynamic_update_slice, scatter
@@ -200,4 +201,5 @@ CONTROL = {
     "eigh": _eigh,
     "sort": _sort,
     "tile": _tile,
+    call_p.name: module_call,
 }

@@ -26,7 +26,8 @@ from udkjax.arrays import TreeMethod
 _KNOWN = frozenset("abc builtins collections equinox functools itertools jax jaxlib jaxtyping math numpy operator typing".split())
 _FOLDERS = ("equations/laws", "native/language", "native/lowering", "native/parts", "native/pseudoinverses", "pinv")
 _PACKAGE = Path(__file__).parents[2]
-_PREFIXES = tuple(f"{_PACKAGE.name}.{folder.replace('/', '.')}" for folder in _FOLDERS)
+_FILES = ("integrate/stabilization.py",)  # with classes from which those of users are derived
+_PREFIXES = tuple(f"{_PACKAGE.name}.{x.removesuffix('.py').replace('/', '.')}" for x in (*_FOLDERS, *_FILES))
 _CHANGING = frozenset("fromfile fromregex genfromtxt load loadtxt memmap random".split())  # functions whose results may change
 _WITHOUT_KEY = frozenset("__import__ breakpoint compile eval exec globals hash id input locals open vars".split())
 _GENERATED = frozenset("__eq__ __hash__ __init__ __replace__ __repr__".split())  # by dataclasses; tracing does not use them
@@ -56,6 +57,7 @@ def _versions() -> tuple[Any, ...]:
         _UnknownError: the package has no files.
     """
     files = [file for folder in _FOLDERS for file in sorted((_PACKAGE / folder).rglob("*.py"))]
+    files += [_PACKAGE / name for name in _FILES] if files else []
     if not files:
         raise _UnknownError
     times = [(str(file), (status := os.stat(file)).st_mtime_ns, status.st_size) for file in files]

@@ -37,7 +37,7 @@ class RunArrays(Running):
         """Reserve memory for all arrays; layout.py describes them."""
         plan, code, n, m = self.plan, self.code, self.n, self.m
         p = self.places = Layout(plan.width, plan.vector)
-        for name in (*LANE_NUMBERS, *(plan.formulation.settings if plan.formulation else ())):
+        for name in (*LANE_NUMBERS, *plan.own_settings):
             p.add(name)
         p.add("constants", -(-self.constants // SPARE) * SPARE)
         p.add("state t")
@@ -115,7 +115,7 @@ class RunArrays(Running):
         }
         if not self.unrolled:
             named |= {x: x for x in self.code.scratch}
-        named |= {x: x for part in (self.fallback, self.accelerations, self.friction) for x in part.arrays}
+        named |= {x: x for part in (self.fallback, self.accelerations, self.projection, self.friction) for x in part.arrays}
         named |= {x: x for x in ("drift", "couplings") if x in self.places.places}
         return {x: ("work", self.places[place]) for x, place in named.items()}
 

@@ -66,6 +66,12 @@ class Plan:
     formulation: Any = None  # the `FormulationCode` of accelerations; None: the Udwadia-Kalaba equation
     stiff: Method | None = None  # the implicit method to which an explicit run changes where it is stiff
     leaves: bool = False  # whether a run leaves the module where it may be stiff, for one that has the implicit method
+    stabilization: Any = None  # the `StabilizationCode` of a user; None: projection, or nothing
+
+    @property
+    def own_settings(self) -> tuple[str, ...]:
+        """The names of the settings of the formulation and the stabilization."""
+        return tuple(name for part in (self.formulation, self.stabilization) if part is not None for name in part.settings)
 
 
 @dataclass

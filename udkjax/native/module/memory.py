@@ -37,6 +37,7 @@ class Memory:
     m: int  # rows of Psi
     rowcount: int  # number of registers of an array of coordinates
     stage_accelerations: list[str]
+    stage_slips: Sequence[str] = ()  # rates of q minus v at the stages, if they differ
 
     settings: tuple[str, ...] = SETTINGS
     inputs: tuple[str, ...] = ()  # in addition to `INPUTS`

@@ -34,8 +34,7 @@ class Module(RunArrays):
         self.n, self.m = n, m
         if plan.sampled:
             self.inputs = ("samples", *self.inputs)
-        if plan.formulation is not None:
-            self.settings = (*self.settings, *plan.formulation.settings)
+        self.settings = (*self.settings, *plan.own_settings)
         self.pieces = code.piece_count if plan.breaks else 0
         self.edges = max(self.pieces - code.first_edge, 0) if self.pieces else 0  # pieces that end where a load changes its sign
         self.stiffness = StiffnessPart(plan)

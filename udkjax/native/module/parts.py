@@ -90,11 +90,20 @@ class ProjectionPart(Part):
     def close_stage(self, f: Function, s: Lane):
         """Close the state of a stage."""
 
+    def end_stage(self, f: Function, i: int):
+        """Change the accelerations of a stage to what is integrated."""
+
     def end_step(self, f: Function, s: Lane):
         """Compute `state q`, `result v` and `result a` at the end of a step, and estimate its errors."""
 
     def project_output(self, f: Function, s: Lane, mask: Value):
         """Project the state of `due` lanes to `state q` and `result v`; set `violated` to the largest violation of Psi."""
+
+    slips = False  # whether positions are integrated at other rates than v
+
+    def slipped_between(self, f: Function, s: Lane, r: Value) -> Value:
+        """Return one register of how far positions are from the integral of v at the time `next`."""
+        raise NotImplementedError
 
     def judge(self, f: Function, s: Lane, accept: Value, lost: Variable):
         """Set `lost` to the status of lanes whose new point ends their run."""

@@ -24,6 +24,13 @@ class Unprojected(ProjectionPart):
         return ["accelerations"]
 
     def end_step(self, f: Function, s: Lane):
+        self.accelerate_end(f, s)
+        estimate_errors(self._in, f, s, "result a", "result dq", "result dv")
+        for d in ("dq", "dv"):
+            self._in.copy(f, f"result {d}", f"state {d}")
+
+    def accelerate_end(self, f: Function, s: Lane):
+        """Compute `result v` and `result a` of the state."""
         module, accelerations = self._in, self._accelerations
         if module.m:
             accelerations.accelerate_and_measure(f)
@@ -32,10 +39,6 @@ class Unprojected(ProjectionPart):
         accelerations.check_pivots(f, s, "result a")
         with f.each(module.rowcount) as r:
             module.put(f, "result v", r, module.vector(f, "state v", r))
-        estimate_errors(module, f, s, "result a", "result dq", "result dv")
-        with f.each(module.rowcount) as r:
-            for d in ("dq", "dv"):
-                module.put(f, f"state {d}", r, module.vector(f, f"result {d}", r))
 
     def project_output(self, f: Function, s: Lane, mask: Value):
         module = self._in
@@ -164,6 +167,8 @@ def estimate_errors(module: Module, f: Function, s: Lane, end: str | None, to_q:
         with f.each(module.rowcount) as r:
             error_q, error_v = (module.weighted_sum(f, weights, r, names) for weights in (method.error_q, method.error_v))
             new_q = zero if error_q is None else h * (h * error_q)
+            slips = module.weighted_sum(f, method.error_v, r, module.stage_slips) if module.stage_slips else None
+            new_q = new_q if slips is None else f.fma(h, slips, new_q)
             for to, new in ((to_q, new_q), (to_v, zero if error_v is None else h * error_v)):
                 module.put(f, to, r, new if mask is None else f.select(mask, new, module.vector(f, to, r)))
     module.stiffness.smooth_error(f, s)

@@ -14,6 +14,8 @@ def write_differences(module: Module, name: str = "differences", to: tuple[str, 
     short = _short_steps(module, f, s)
     with f.each(module.registers(pointer)) as r:
         points = {x: [module.vector(f, f"point{POINTS - 1 - k} {x}", r, pointer) for k in range(POINTS)] for x in "qva"}
+        if module.projection.slips:
+            points["q"] = [q - module.vector(f, f"point{POINTS - 1 - k} slipped", r) for k, q in enumerate(points["q"])]
         column = [x for x in points["q"] for _ in range(3)]  # each point is a triple node, of its q, v and a (Hermite)
         given = {1: points["v"], 2: [a * 0.5 for a in points["a"]]}
         module.put(f, "difference0", r, column[0], pointer)
@@ -113,6 +115,7 @@ def write_between(module: Module, name: str = "between", to: tuple[str, Layout] 
             d = ahead[k // 3]
             v = f.fma(v, d, q)
             q = f.fma(q, d, module.vector(f, f"difference{k}", r, pointer))
+        q = q + module.projection.slipped_between(f, s, r) if module.projection.slips else q
         module.put(f, "state q", r, q, pointer)
         module.put(f, "state v", r, v, pointer)
 

@@ -30,13 +30,14 @@ def write_attempt(module: Module):
             module.projection.close_stage(f, s)
             module.accelerate_stage(f, i)
             module.accelerations.check_pivots(f, s, f"stage{i} a")
+            module.projection.end_stage(f, i)
             module.record_stage(f, s, i)
 
     def clear_stages():
         # Stages may hold NaN of a failed member, which would survive multiplication by a step of zero.
         with f.each(module.rowcount) as r:
-            for i in range(1, module.stages):
-                module.put(f, f"stage{i} a", r, f.const(0.0, DOUBLE, module.plan.vector))
+            for name in (*module.stage_accelerations[1:], *module.stage_slips[1:]):
+                module.put(f, name, r, f.const(0.0, DOUBLE, module.plan.vector))
 
     implicit = s.begin < -0.5
     module.projection.begin_step(f, s)
@@ -92,12 +93,15 @@ def stage_state(
 ):
     """Compute the state of stage i of the step from a point, by one of the module's methods, in all or some lanes."""
     step, method = s.step if step is None else step, method or module.method
-    h, names = module.broadcast(f, step), [f"{start} a", *module.stage_accelerations[1:]]
+    h, names = module.broadcast(f, step), list(module.stage_accelerations)
+    names[0] = names[0] if start == "point3" else f"{start} a"
     setattr(s, "state t", f.fma(step, float(method.nodes[i]), getattr(s, f"{start}_t")))
     with f.each(module.rowcount) as r:
         q, v = module.vector(f, f"{start} q", r), module.vector(f, f"{start} v", r)
         sum_q, sum_v = module.weighted_sum(f, method.q[i], r, names), module.weighted_sum(f, method.v[i], r, names)
         slope = v * float(method.nodes[i]) if sum_q is None else f.fma(h, sum_q, v * float(method.nodes[i]))
+        slips = module.weighted_sum(f, method.v[i], r, module.stage_slips) if module.stage_slips else None
+        slope = slope if slips is None else slope + slips
         for x, new in (("q", f.fma(h, slope, q)), ("v", v if sum_v is None else f.fma(h, sum_v, v))):
             old = None if mask is None else module.vector(f, f"state {x}", r)
             module.put(f, f"state {x}", r, new if mask is None or old is None else f.select(mask, new, old))

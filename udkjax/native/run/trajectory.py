@@ -33,6 +33,7 @@ from udkjax.native.parts.elimination import EliminatedAccelerations
 from udkjax.native.parts.formulations import Formulated
 from udkjax.native.parts.partitioning import ByPartition
 from udkjax.native.parts.projection import Projected, Unprojected
+from udkjax.native.parts.stabilized import Stabilized
 from udkjax.native.run.breakpoints import aim
 from udkjax.native.run.controller import write_decide
 from udkjax.native.run.dense_output import write_between, write_differences, write_outputs
@@ -61,7 +62,10 @@ class Trajectory(Module):
             return
         solver = DenseEquations(self, method) if method else EliminatedAccelerations(self)
         self.accelerations = Formulated(self, solver, formulation) if formulation else solver
-        self.projection = Projected(self) if plan.projected else Unprojected(self, self.accelerations)
+        if plan.stabilization is not None:
+            self.projection = Stabilized(self, self.accelerations, plan.stabilization)
+        else:
+            self.projection = Projected(self) if plan.projected else Unprojected(self, self.accelerations)
         self.fallback = fallback_of(self)
 
     def write_programs(self):

@@ -1,0 +1,88 @@
+"""Calls of functions of a module from a user's text: a primitive of JAX, and its lowering.
+
+Arguments and results are arrays at fixed places in the memory of the module.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jax.core import ShapedArray
+from jax.extend import core
+from jaxtyping import Array as JaxArray
+
+from udkjax.native.language.ir import DOUBLE
+from udkjax.native.lowering.arrays import Array, Stored
+from udkjax.native.lowering.lowering import Lowering
+from udkjax.native.lowering.varying import without_constants
+
+
+class Call(NamedTuple):
+    """A call of functions of a module, one after another.
+
+    If the `first` arguments are those of an earlier call of the same functions, all functions but the last have been called.
+    """
+
+    functions: tuple[str, ...]
+    arguments: tuple[str, ...]  # names of their places
+    results: tuple[tuple[str, tuple[int, ...]], ...]  # names of their places, and shapes
+    first: int = 0
+
+    def __call__(self, *arguments: Any) -> list[JaxArray]:
+        """Return the results, in a text that JAX traces."""
+        return call_p.bind(*(jnp.asarray(x, float) for x in arguments), call=self)
+
+
+call_p = core.Primitive("a function of the module")
+call_p.multiple_results = True
+call_p.def_abstract_eval(lambda *_, call: [ShapedArray(shape, jnp.dtype(float)) for _, shape in call.results])
+
+
+def module_call(to: Lowering, equation: Any, inputs: list[Array]) -> list[Array]:
+    """Write the arguments to their places, call the functions, and copy the results."""
+    f, call = to.f, equation.params["call"]
+
+    def place(name: str, shape: Sequence[int]) -> Stored:
+        return Stored(f.given[name], shape, DOUBLE, True)
+
+    for name, x in zip(call.arguments, inputs, strict=True):
+        to.fill(place(name, x.shape), x)
+    for function in call.functions:
+        f.call(function, f.given["work"])
+    return [to.copied(place(name, shape)) for name, shape in call.results]
+
+
+def simplified(closed: Any) -> Any:
+    """Return a jaxpr without unused results, without repeated calls of a module, and without preparations that still hold."""
+    jaxpr, same, known, equations = closed.jaxpr, {}, {}, []
+    prepared: Any = None
+    for e in jaxpr.eqns:
+        e = e.replace(invars=[a if isinstance(a, core.Literal) else same.get(a, a) for a in e.invars])
+        if e.primitive is call_p:
+            call, places = e.params["call"], tuple(map(id, e.invars))
+            if (call, places) in known:
+                same.update(zip(e.outvars, known[call, places], strict=True))
+                continue
+            known[call, places] = e.outvars
+            if len(call.functions) > 1:
+                now = call.functions[:-1], places[: call.first]
+                if now == prepared:
+                    e = e.replace(params={"call": call._replace(functions=call.functions[-1:])})
+                prepared = now
+        elif _has_calls(e):
+            prepared = None
+        equations.append(e)
+    outvars = [a if isinstance(a, core.Literal) else same.get(a, a) for a in jaxpr.outvars]
+    used, kept = {id(a) for a in outvars}, []
+    for e in reversed(equations):
+        if any(id(a) in used for a in e.outvars):
+            used.update(map(id, e.invars))
+            kept.append(e)
+    return closed.replace(jaxpr=jaxpr.replace(eqns=kept[::-1], outvars=outvars))
+
+
+def _has_calls(equation: Any) -> bool:
+    """Return whether the programs within an equation call functions of a module."""
+    parts = (x for p in equation.params.values() for x in (p if isinstance(p, tuple | list) else (p,)))
+    inner = (e for x in parts for e in getattr(without_constants(x), "eqns", ()))
+    return any(e.primitive is call_p or _has_calls(e) for e in inner)
