@@ -73,7 +73,8 @@ class Stabilization(PrintsLine):
 
     `rates(at, v, a)` returns q' and v' that are integrated instead of v and a; `at.h` is the length of the present step, on which
     gains may depend. `end_of_step(at)` returns the state from which the next step starts. Both receive a `ConstraintState`, and
-    are written in jax.numpy, with numbers that are fields. By default neither changes anything.
+    are written in jax.numpy, with numbers that are fields. By default neither changes anything. With explicit solvers machine
+    code runs them, if it has all of their operations; diffrax has the derivatives.
     """
 
     def rates(self, at: ConstraintState, v: Vector, a: Vector) -> tuple[Vector, Vector]:
