@@ -13,7 +13,7 @@ import udkjax as udk
 from experiments.parts.atlas_own import BraunGoldfarb
 from tests.integrate.systems.own_systems import G, pendulum
 from tests.integrate.systems.test_own_methods import BenIsrael
-from udkjax.native.lowering.module_calls import Call, call_p, simplified
+from udkjax.native.lowering.module_calls import ModuleCall, call_p, simplified
 
 RATE = np.sqrt(G / 0.6)  # of the conical pendulum 0.6 m below its pivot
 ON = udk.State([0.8, 0.0, -0.6], [0.0, 0.8 * RATE, 0.0])
@@ -214,8 +214,8 @@ def test_other_arguments_without_machine_code():
 
 def test_calls_that_are_left_out():
     """Repeated and unused calls; and preparations, unless the memory of the module holds another one since."""
-    solve = Call(("factor", "solve"), ("q", "b"), (("x", (2,)),), 1)
-    psi = Call(("psi",), ("q",), (("y", (2,)),))
+    solve = ModuleCall(("factor", "solve"), ("q", "b"), (("x", (2,)),), 1)
+    psi = ModuleCall(("psi",), ("q",), (("y", (2,)),))
 
     def text(q, r):
         (y,), (again,), (unused,) = psi(q), psi(q), psi(r)

@@ -17,7 +17,7 @@ from udkjax.native.lowering.lowering import Lowering
 from udkjax.native.lowering.varying import without_constants
 
 
-class Call(NamedTuple):
+class ModuleCall(NamedTuple):
     """A call of functions of a module, one after another.
 
     If the `first` arguments are those of an earlier call of the same functions, all functions but the last have been called.

@@ -21,7 +21,7 @@ from jaxtyping import Array
 from udkjax.equations.programs.run_programs import RunPrograms
 from udkjax.native.language.ir import DOUBLE, INT, Function, Value
 from udkjax.native.language.program import UnsupportedError
-from udkjax.native.lowering.module_calls import Call
+from udkjax.native.lowering.module_calls import ModuleCall
 from udkjax.native.lowering.own_objects import Input, OwnObject, Written, named, numbers_of, written
 from udkjax.native.module.layout import Lane
 from udkjax.native.module.module import Module
@@ -56,7 +56,7 @@ class ModuleEquations(eqx.Module):
         return jnp.diag(self._found("mass", "at_x", self.n, t, q, v))
 
     def _found(self, function: str, place: str, count: int, *state: Any) -> Array:
-        return Call((f"stabilization_{function}",), STATE, ((place, (count,)),))(*state)[0]
+        return ModuleCall((f"stabilization_{function}",), STATE, ((place, (count,)),))(*state)[0]
 
     def least_change(self, t: Any, q: Any, v: Any, residual: Any, count: int) -> Array:
         if jnp.shape(residual) != (count,):
@@ -65,7 +65,7 @@ class ModuleEquations(eqx.Module):
             return jnp.zeros(self.n)
         given = jnp.concatenate([jnp.asarray(residual, float), jnp.zeros(self.rows - count)])
         factor = "stabilization_factor" + ("_positions" if count < self.rows else "")
-        call = Call((factor, "stabilization_solve"), (*STATE, "at_b"), (("at_x", (self.n,)),), len(STATE))
+        call = ModuleCall((factor, "stabilization_solve"), (*STATE, "at_b"), (("at_x", (self.n,)),), len(STATE))
         return call(t, q, v, given)[0]
 
 
