@@ -6,39 +6,6 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax as udk
-from tests.choices import fast
-
-TURN = np.linspace(0.0, 2 * np.pi, 25)
-CASES = {
-    "a full turn": (udk.library.four_bar, "body.crank.angle", 1.0 + TURN),
-    "to a toggle": (udk.library.four_bar, "body.rocker.angle", np.linspace(1.6, 4.0, 9)),
-    "through meetings of branches": (udk.library.parallelogram, "body.link1.angle", 0.3 + TURN),
-}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", CASES)
-def test_positions_of_concrete_and_of_traced_numbers(name):
-    make, driver, values = CASES[name]
-    mechanism = make()
-    known = udk.kinematics(mechanism, driver, values)
-    traced = jax.jit(lambda values: udk.kinematics(mechanism, driver, values))(values)
-    assert_allclose(known.status, traced.status)
-    for name in ("q", "v", "limit", "limit_q"):
-        assert_allclose(getattr(known, name), getattr(traced, name), rtol=1e-9, atol=1e-9)
-    assert_allclose(known.a, traced.a, rtol=1e-6, atol=1e-6)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", fast(["to a toggle"], CASES))
-def test_limits_of_concrete_and_of_traced_numbers(name):
-    make, driver, _ = CASES[name]
-    mechanism = make()
-    known = udk.travel(mechanism, driver)
-    traced = jax.jit(lambda shift: udk.travel(mechanism.with_parameters({"gravity": [0.0, shift]}), driver))(-9.81)
-    for name in ("lower", "upper", "status"):
-        assert_allclose(getattr(known, name), getattr(traced, name), rtol=1e-10)
-
 
 LINKAGE = udk.Drawing(
     pins={"A": [0, 0], "B": udk.polar("A", "r", 60), "C": udk.circles("BD", ("3*r", "2*r"), "left"), "D": ["3*r", 0]},
