@@ -9,7 +9,7 @@ identification     the public function
 
 from udkjax.positions.assembling.channels import Quantity as Quantity
 from udkjax.study.identify.answers.estimate import Estimate as Estimate
-from udkjax.study.identify.answers.gradient_check import GradientCheck as GradientCheck
+from udkjax.study.identify.answers.gradient_agreement import GradientCheck as GradientCheck
 from udkjax.study.identify.answers.gradient_check import check_gradients as check_gradients
 from udkjax.study.identify.identification import identify as identify
 from udkjax.study.identify.problem.parameters import Parameter as Parameter

@@ -15,7 +15,8 @@ from udkjax.integrate.solution import scene_text, versions
 from udkjax.positions.assembling.assembly import State
 from udkjax.printing import PrintedTable, html_table, text_table
 from udkjax.scene.arguments import checked
-from udkjax.study.identify.answers.gradient_check import GradientCheck, compare_gradients
+from udkjax.study.identify.answers.gradient_agreement import GradientCheck
+from udkjax.study.identify.answers.gradient_check import compare_gradients
 from udkjax.study.identify.answers.joint_profile import JointProfile, confidence_ellipse, joint_profile, require_two
 from udkjax.study.identify.answers.profile_likelihood import CONFIDENCE, ProfileLikelihood, profile_likelihood, profiles_dataset
 from udkjax.study.identify.answers.uncertainty import Uncertainty
