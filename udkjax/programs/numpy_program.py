@@ -13,7 +13,8 @@ import jax
 import numpy as np
 from jax.extend.core import Jaxpr, Literal, Primitive, jaxprs_in_params
 
-from udkjax.programs.numpy_rules import PRESERVED, RULES, plain_step
+from udkjax.programs.numpy_rules import PRESERVED, RULES
+from udkjax.programs.plain_steps import plain_step
 
 Step = tuple[Callable[..., Any], list[int], Any]  # a function, and the places of its arguments and of its result or results
 ENTRIES = 2_000  # number of array entries that take as long as the overhead of an operation
