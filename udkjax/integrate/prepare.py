@@ -1,6 +1,5 @@
 """Preparation of all kinds of runs before their first step, with concrete or traced numbers."""
 
-from collections.abc import Sequence
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -124,9 +123,11 @@ def with_held_pins(
     Constraints may prevent a pin from turning to second order only. Its angle is then held to first order, unless an event
     removes a constraint.
     """
-    listed = () if events is None else events if isinstance(events, Sequence) else (events,)
-    if any(getattr(getattr(event, "action", None), "removed", None) for event in listed):
-        return mechanism, analysis, choices
+    if events is not None:
+        from udkjax.integrate.events.law.event import listed_events  # other runs do not need the modules of events
+
+        if any(getattr(getattr(event, "action", None), "removed", None) for event in listed_events(events)):
+            return mechanism, analysis, choices
     holding = hold_pins(mechanism)
     if holding is None:
         return mechanism, analysis, choices

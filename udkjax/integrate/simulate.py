@@ -130,8 +130,8 @@ def simulate(
             solver, adjoint, progress meter and method; machine code evaluates the equations where possible. "jax" is
             "diffrax" with equations in plain JAX, on every device. "auto" uses machine code where possible;
             `Solution.settings` names the engine and the reason.
-        events: actions where conditions cross zero: an `Event`, `JointLimit` or `Contact`, or a list of them, with the
-            actions `Stop`, `Log`, `Impact`, `Release`, `Attach` and `Lock`. Events are located to machine precision,
+        events: actions where conditions cross zero: an `Event`, `JointLimit` or `Contact`, or several, in a list or by name, with
+            the actions `Stop`, `Log`, `Impact`, `Release`, `Attach` and `Lock`. Events are located to machine precision,
             independently of `ts`, and the run restarts after each; contacts that act on one another are hit together. Both
             engines support events, also in batches, where each member has its own events. Such runs have first derivatives,
             forward and reverse, which include the changes of event times (saltation), but no derivatives with respect to `ts`;

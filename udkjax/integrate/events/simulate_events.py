@@ -24,7 +24,15 @@ from udkjax.integrate.compiled_mechanism import compile_concrete, compile_mechan
 from udkjax.integrate.events.instant.changes import scene_changes
 from udkjax.integrate.events.instant.listing import listing, names_of_events
 from udkjax.integrate.events.instant.runs import EventRun
-from udkjax.integrate.events.law.event import Event, Events, ExpandsToEvents, expand_events, has_usable_numbers
+from udkjax.integrate.events.law.event import (
+    Event,
+    Events,
+    EventsLike,
+    ExpandsToEvents,
+    expand_events,
+    has_usable_numbers,
+    listed_events,
+)
 from udkjax.integrate.events.law.event_plan import event_plan
 from udkjax.integrate.events.law.kinks import FREE, renewed_sides, with_held_forces
 from udkjax.integrate.events.law.phases import SCENE, Phases, phases_of
@@ -64,7 +72,7 @@ class Given(NamedTuple):
 
 def simulate_events(
     mechanism: Any,
-    events: ExpandsToEvents | Sequence[ExpandsToEvents] | None,
+    events: EventsLike | None,
     analysis: Analysis | None,
     ts: Any,
     state: State | None,
@@ -135,9 +143,9 @@ def _run_at_once(given: Given) -> tuple[EventRun, tuple[str, ...]] | None:
 Prepared = tuple[tuple[Event, ...], Phases]
 
 
-def _prepare(mechanism: Any, events: ExpandsToEvents | Sequence[ExpandsToEvents] | None, analysis: Analysis | None) -> Prepared:
+def _prepare(mechanism: Any, events: EventsLike | None, analysis: Analysis | None) -> Prepared:
     """Return all events, with unique names, and the phases that they lead to; cached if all numbers are concrete."""
-    listed = events if events is None else tuple(events) if isinstance(events, Sequence) else (events,)
+    listed = None if events is None else listed_events(events)
     if not is_concrete(mechanism, analysis, *(listed or ())):
         return _expand(mechanism, listed, analysis)
     return _expand_concrete(mechanism, analysis, listed is None, *(listed or ()))

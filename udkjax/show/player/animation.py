@@ -13,7 +13,7 @@ from udkjax.argument_types import COORDINATES_OF_BODIES, require_history
 from udkjax.equations.systems.general import ConstrainedSystem
 from udkjax.extras import WRITERS, require
 from udkjax.integrate.events.law.conditions import Gap
-from udkjax.integrate.events.law.event import ExpandsToEvents, expand_events
+from udkjax.integrate.events.law.event import EventsLike, ExpandsToEvents, expand_events, listed_events
 from udkjax.integrate.simulate import simulate
 from udkjax.positions.gaps.gaps import LeastGaps
 from udkjax.scene.arguments import checked, require_mechanism
@@ -186,7 +186,7 @@ def animate(
     title: str | None = None,
     live: Live = False,
     gaps: ShownGaps = False,
-    events: ExpandsToEvents | Sequence[ExpandsToEvents] = (),
+    events: EventsLike = (),
 ) -> Animation:
     """Show the motion of a mechanism, or several motions side by side and synchronized.
 
@@ -233,7 +233,7 @@ def animate(
         mechanism, solution, curves = drawn_system(mechanism, solution, drawing)
         measures = curves if isinstance(measures, Sequence) else measures
         title = title or "system"
-    events = tuple(events) if isinstance(events, Sequence) else (events,)
+    events = listed_events(events)
     if events and not live:
         raise ValueError("events: needed only for a live page; otherwise the events of the solution are shown: leave them out")
     if gaps and live:

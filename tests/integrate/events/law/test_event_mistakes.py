@@ -8,6 +8,7 @@ import pytest
 
 import udkjax as udk
 from tests.integrate.events.event_scenes import PENDULUM, TS
+from udkjax.integrate.events.law.event import listed_events
 
 
 @pytest.mark.parametrize(
@@ -46,8 +47,24 @@ from tests.integrate.events.event_scenes import PENDULUM, TS
         ([udk.Contact("link"), udk.Contact("link")], "two events have this name"),
         ([], "the list is empty"),
         ([1.0], r"events\[0\]: must be an Event"),
+        ({}, "the list is empty"),
+        ({"floor": 1.0}, r'events\["floor"\]: must be an Event, a JointLimit or a Contact, not 1.0'),
+        ({1: udk.Contact("link")}, "events: name must be a string, not 1"),
     ],
 )
 def test_mistakes_are_named(events, message):
     with pytest.raises((ValueError, TypeError), match=message):
         udk.simulate(PENDULUM, TS, events=events)
+
+
+def test_events_by_name_are_those_of_a_list_with_names():
+    """The same object under a name compiles nothing anew."""
+    limit, log = udk.JointLimit("A", lower=-0.5), udk.Event(lambda t, at: at["link"].angle, udk.Log())
+    by_name = [udk.simulate(PENDULUM, TS, events={"stop": limit, "low": log}) for _ in range(2)]
+    listed = udk.simulate(
+        PENDULUM, TS, events=[udk.JointLimit("A", lower=-0.5, name="stop"), udk.Event(log.condition, udk.Log(), name="low")]
+    )
+    for run in by_name:
+        assert run.events.names == listed.events.names and "stop.lower" in run.events.names and "low" in run.events.names
+        np.testing.assert_array_equal(run.q, listed.q)
+    assert listed_events({"low": log})[0] is listed_events({"low": log})[0]

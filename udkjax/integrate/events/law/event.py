@@ -9,10 +9,11 @@ Ready-made ones: `JointLimit`, `Contact`. Numbers that are traced or differentia
 is the condition, like the ready-made ones: numbers that a plain function closes over are fixed when it is compiled.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
+from dataclasses import is_dataclass, replace
 from functools import reduce
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, TypeAlias
 
 import equinox as eqx
 import jax
@@ -35,6 +36,7 @@ from udkjax.integrate.events.law.conditions import (
     sees_velocity,
 )
 from udkjax.printing import PrintedTable, PrintsLine, PrintsTable, units
+from udkjax.programs.identity_cache import cached_by_identity
 from udkjax.requirements import ArgumentTypeError, describe, require_function, require_text
 from udkjax.scene.elements.bodies import GROUND
 from udkjax.scene.mechanism import Mechanism
@@ -221,6 +223,28 @@ class ExpandsToEvents(Protocol):
         ...
 
 
+EventsLike: TypeAlias = ExpandsToEvents | Sequence[ExpandsToEvents] | Mapping[str, ExpandsToEvents]
+
+
+def listed_events(events: EventsLike) -> tuple[ExpandsToEvents, ...]:
+    """Return an event, a list of events, or events by name as a tuple. Raises `ValueError`."""
+    if isinstance(events, Mapping):
+        return tuple(_called(event, name) for name, event in events.items())
+    return tuple(events) if isinstance(events, Sequence) else (events,)
+
+
+@cached_by_identity  # the same events again compile nothing
+def _called(event: Any, name: str) -> ExpandsToEvents:
+    require_text("events: name", name)
+    if not hasattr(event, "expand") or not is_dataclass(event) or isinstance(event, type):
+        raise ValueError(f"events[{quote(name)}]: {_expected(event)}")
+    return replace(event, name=name)
+
+
+def _expected(event: Any) -> str:
+    return f"must be an Event, a JointLimit or a Contact, {describe(event)}"
+
+
 def expand_events(events: Sequence[ExpandsToEvents], mechanism: Any) -> tuple[Event, ...]:
     """Return all events with unique names. Raises `ValueError` if one is invalid."""
     found: list[Event] = []
@@ -238,7 +262,7 @@ def expand_events(events: Sequence[ExpandsToEvents], mechanism: Any) -> tuple[Ev
 
 def _expand(event: ExpandsToEvents, k: int, mechanism: Any, found: list[Event]) -> None:
     if not hasattr(event, "expand"):
-        raise ValueError(f"must be an Event, a JointLimit or a Contact, not a {type(event).__name__}")
+        raise ValueError(_expected(event))
     if not isinstance(event, Event):
         cure = "write udk.Event(lambda t, q, v: ...) for this system"
         mechanism.require_bodies(f"a {type(event).__name__} is for mechanisms; {cure}")
