@@ -14,8 +14,10 @@ from udkjax.integrate.events import Release as Release
 from udkjax.integrate.events import Stop as Stop
 from udkjax.integrate.events.law.conditions import Gap as Gap
 from udkjax.integrate.events.law.conditions import frames_of as frames_of
+from udkjax.integrate.events.law.event import EventsLike as EventsLike
 from udkjax.integrate.events.law.event import ExpandsToEvents as ExpandsToEvents
 from udkjax.integrate.events.law.event import expand_events as expand_events
+from udkjax.integrate.events.law.event import listed_events as listed_events
 from udkjax.integrate.portable import drawn_points as drawn_points
 from udkjax.integrate.portable import portable_engine as portable_engine
 from udkjax.integrate.portable import scalar_parameters as scalar_parameters
