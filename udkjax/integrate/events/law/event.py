@@ -238,7 +238,8 @@ def _called(event: Any, name: str) -> ExpandsToEvents:
     require_text("events: name", name)
     if not hasattr(event, "expand") or not is_dataclass(event) or isinstance(event, type):
         raise ValueError(f"events[{quote(name)}]: {_expected(event)}")
-    return replace(event, name=name)
+    named: Any = replace(event, name=name)
+    return named
 
 
 def _expected(event: Any) -> str:
