@@ -16,6 +16,7 @@ from numpy.testing import assert_array_equal
 
 import udkjax as udk
 from tests.integrate.systems.test_own_methods import BenIsrael, Together
+from tests.integrate.systems.test_own_stabilizations import NewtonAndRates
 from tests.native.gpu import ptx_as_c
 from tests.native.gpu.test_host_handler import ADDRESS, ERROR, STREAM, Card
 from udkjax.native import loaded_code, primitive, records
@@ -71,6 +72,7 @@ RUNS = {
     "SVD": last(LINKAGE, "body.coupler.mass", method=udk.SVD()),
     "own pseudoinverse": last(LINKAGE, "body.coupler.mass", method=BenIsrael()),
     "own formulation": last(FOUR_BAR, "pin.B[0]", 3, formulation=Together()),
+    "own stabilization": last(LINKAGE, "body.coupler.mass", 4, stabilization=NewtonAndRates()),
     "tangent": with_tangent(last(PENDULUM, "body.rod.mass", 4)),
     "two tangents": jax.jacfwd(lambda x: last(FOUR_BAR, "pin.B", 3)(jnp.stack([x, 1.0]))),
     "gradient": with_gradient(last(PENDULUM, "body.rod.mass", 4)),
