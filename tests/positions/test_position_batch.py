@@ -5,6 +5,7 @@ import pytest
 
 import udkjax as udk
 from udkjax.positions.following.drive import drive
+from udkjax.positions.following.free_numbers import FreeNumbers
 
 FOUR_BAR = udk.Drawing(
     pins={"O": (0, 0), "A": (0.03, 0.04), "B": (0.12, 0.09), "P": (0.06, 0.12), "C": (0.1, 0)},
@@ -105,3 +106,11 @@ def test_a_member_that_cannot_go_on_does_not_hold_up_the_others():
     given["pin.C"][3] = [0.14, 0.02]
     found = BATCH(given, START + np.array([6.0]))
     assert not found.reached[3, 0] and np.delete(found.reached, 3, axis=0).all()
+
+
+def test_a_model_is_traced_once(monkeypatch):
+    """Its parts have the moved mechanism in common, whose trace takes most of the time before the first position."""
+    moved, calls = FreeNumbers.moved, []
+    monkeypatch.setattr(FreeNumbers, "moved", lambda self, x: calls.append(1) or moved(self, x))
+    found = udk.PositionBatch(MECH, "motor", ["pin.A"])({"pin.A": np.array([[0.03, 0.04]])}, [START])
+    assert len(calls) == 1 and found.reached.all()

@@ -196,7 +196,12 @@ class PositionPrograms:
 def trace_model(model: PositionModel, parameters: int, coordinates: int, data: int = 0) -> TracedModel:
     """Trace a model for any number of programs; the arguments are those of `PositionPrograms`."""
     examples = jnp.zeros(parameters), jnp.zeros(()), jnp.zeros(coordinates), jnp.zeros(data)
-    return trace(lambda *numbers: [model(*numbers)[k] for k in ("psi", "q0", "s0", "measures")], *examples)
+
+    def parts(*numbers: jax.Array) -> list[jax.Array]:
+        found = model(*numbers)
+        return [found[k] for k in ("psi", "q0", "s0", "measures")]
+
+    return trace(parts, *examples)
 
 
 def _inputs(graph: Graph, name: str, group: str, count: int) -> list[Scalar]:
