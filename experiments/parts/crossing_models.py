@@ -1,6 +1,7 @@
 """Models in which every feature of a scene occurs, for the table of functions by models (experiments/crossings.py)."""
 
 from collections.abc import Callable
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -161,6 +162,45 @@ def with_driver(motion: udk.Motion) -> Callable[[], udk.Mechanism]:
     return lambda: plain(drivers={"motor": udk.Driver(["ground", CRANK], "angle", motion)})
 
 
+def jack() -> udk.Mechanism:
+    """A screw that a torque turns lifts a nut in an inclined guide, which the nut loads across; both rub."""
+    bodies = {"screw": udk.Body(2.0, 0.05, angular_velocity=3.0), "nut": udk.Body(1.0, 0.02, [0.0, 0.1])}
+    guide = ["ground", "nut"], [[0.0, 0.1], [0.0, 0.0]]
+    joints = {
+        "pin": udk.Revolute(["ground", "screw"], [[0.0, 0.0], [0.0, 0.0]]),
+        "guide": udk.Prismatic(*guide, axis=1.2),
+        "thread": udk.Screw(*guide, axis=1.2, turning=["ground", "screw"], lead=0.01),
+    }
+    rubs = {"bearing": udk.Friction("pin", torque=0.05, velocity=0.1), "rub": udk.Friction("guide", coefficient=0.2)}
+    return udk.Mechanism(bodies, joints, forces=rubs | {"motor": udk.Torque(["ground", "screw"], 0.4)})
+
+
+def finger() -> udk.Mechanism:
+    """A finger of three phalanges: a tendon couples the last two, the first rubs, and a torque bends it."""
+    lengths, ends, names = (0.05, 0.03, 0.02), (0.0, 0.05, 0.08), ("proximal", "middle", "distal")
+    bodies = {
+        name: udk.Body(size, size * length**2 / 12, [at + length / 2, 0.0])
+        for name, size, length, at in zip(names, (0.03, 0.02, 0.01), lengths, ends, strict=True)
+    }
+    joints: dict[str, Any] = {"knuckle": udk.Revolute(["ground", "proximal"], [[0.0, 0.0], [-0.025, 0.0]])}
+    for (first, second), (a, b) in zip(pairwise(names), pairwise(lengths), strict=True):
+        joints[second] = udk.Revolute([first, second], [[a / 2, 0.0], [-b / 2, 0.0]])
+    joints["tendon"] = udk.Coupling(["proximal", "middle"], ["middle", "distal"], [0.0, 0.7])
+    forces = {
+        "flexor": udk.Torque(["ground", "proximal"], -0.02),
+        "extensor": udk.TorsionSpring(["proximal", "middle"], 0.05, 1e-4),
+        "rub": udk.Friction("knuckle", torque=1e-3, law="set-valued"),
+    }
+    return udk.Mechanism(bodies, joints, forces=forces)
+
+
+def block() -> udk.Mechanism:
+    """A block that slides along a rail with set-valued friction."""
+    rail = {"rail": udk.Prismatic(["ground", "block"], [[0.0, 0.0], [0.0, 0.0]], axis=0.0)}
+    rub = udk.Friction("rail", coefficient=0.1, law="set-valued")
+    return udk.Mechanism({"block": udk.Body(1.0, 0.1, velocity=[2.0, 0.0])}, rail, forces={"rub": rub})
+
+
 def start_angle() -> float:
     """The angle of the crank of the library's four-bar."""
     return float(udk.library.four_bar().q0[0, 2])
@@ -225,4 +265,9 @@ MODELS: dict[str, Model] = {
         pendulum,
         lambda: udk.Event(lambda t, frames: t - 0.1, udk.Attach(udk.Angle(["a", "b"]), "straight"), direction=1),
     ),
+    "screw, friction": Model(jack),
+    "coupling, contact that sticks": Model(
+        finger, lambda: udk.Contact("distal", [0.01, 0.0], [0.0, -0.03], restitution=0.0, coefficient=1.0)
+    ),
+    "limit, friction, set-valued": Model(block, lambda: udk.JointLimit("rail", upper=0.3)),
 }
