@@ -9,10 +9,10 @@ from typing import Any
 
 # Patterns of messages, and the words in their place; tools have their names and keys in parentheses.
 WORDS: Mapping[str, str] = {
-    r"driver: name the driver or a coordinate, .*: there is none in the scene": (
+    r"driver: the scene has no driver; name a coordinate, such as \S+": (
         "nothing drives the mechanism: put a motor on a pin or a slide (Motor, M)"
     ),
-    r"driver: name the driver or a coordinate, .*: there are (.+)": r"this needs one motor, and there are \1: delete the others",
+    r"driver: the scene has \d+ drivers; name one of (.+)": r"this needs one motor, and there are \1: delete the others",
     r"drive or hold what still moves, (.+), by drivers of the scene": (
         r"put a motor on what still moves, \1 (Motor, M), or fix a pin of it (Ground, G)"
     ),

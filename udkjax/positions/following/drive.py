@@ -138,10 +138,10 @@ def only_driver(mechanism: Mechanism) -> str:
     names = mechanism.driver_names
     if len(names) == 1:
         return names[0]
-    problem = f"the scene has {len(names)} drivers; name one of {', '.join(names)}"
+    problem = f"driver: the scene has {len(names)} drivers; name one of {', '.join(names)}"
     if not names:
-        problem = f"the scene has no driver; name a coordinate, such as {_suggested_coordinate(mechanism)}"
-    raise SceneError([f"driver: {problem}"], mechanism.name)
+        problem = f"driver: the scene has no driver; name a coordinate, such as {_suggested_coordinate(mechanism)}"
+    raise SceneError([problem], mechanism.name)
 
 
 def without_drivers(mechanism: Mechanism, forces: Mapping[str, ForceElement] | None = None) -> Mechanism:
