@@ -229,3 +229,18 @@ def test_calls_that_are_left_out():
     calls = [e.params["call"].functions for e in found.jaxpr.eqns if e.primitive is call_p]
     whole = ("factor", "solve")
     assert calls == [("psi",), whole, ("solve",), whole, whole, whole]
+
+
+class Unused(BraunGoldfarb):
+    """A stabilization that asks for a change which it does not use, before the one that it uses."""
+
+    def rates(self, at, v, a):
+        at.change_of_velocities(3.0 * at.psi_dot)
+        return super().rates(at, v, a)
+
+
+def test_an_unused_change_prepares_nothing():
+    """The call that is left out is the one that would have factored the rows."""
+    scene, ts = udk.library.four_bar(), np.linspace(0.0, 1.0, 3)
+    runs = [udk.simulate(scene, ts, stabilization=x, engine="native").q for x in (BraunGoldfarb(), Unused())]
+    np.testing.assert_array_equal(*runs)

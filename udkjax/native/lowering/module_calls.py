@@ -53,24 +53,16 @@ def module_call(to: Lowering, equation: Any, inputs: list[Array]) -> list[Array]
 
 
 def simplified(closed: Any) -> Any:
-    """Return a jaxpr without unused results, without repeated calls of a module, and without preparations that still hold."""
+    """Return a jaxpr without repeated calls of a module, without unused results, and without preparations that still hold."""
     jaxpr, same, known, equations = closed.jaxpr, {}, {}, []
-    prepared: Any = None
     for e in jaxpr.eqns:
         e = e.replace(invars=[a if isinstance(a, core.Literal) else same.get(a, a) for a in e.invars])
         if e.primitive is call_p:
-            call, places = e.params["call"], tuple(map(id, e.invars))
-            if (call, places) in known:
-                same.update(zip(e.outvars, known[call, places], strict=True))
+            key = e.params["call"], tuple(map(id, e.invars))
+            if key in known:
+                same.update(zip(e.outvars, known[key], strict=True))
                 continue
-            known[call, places] = e.outvars
-            if len(call.functions) > 1:
-                now = call.functions[:-1], places[: call.first]
-                if now == prepared:
-                    e = e.replace(params={"call": call._replace(functions=call.functions[-1:])})
-                prepared = now
-        elif _has_calls(e):
-            prepared = None
+            known[key] = e.outvars
         equations.append(e)
     outvars = [a if isinstance(a, core.Literal) else same.get(a, a) for a in jaxpr.outvars]
     used, kept = {id(a) for a in outvars}, []
@@ -78,7 +70,22 @@ def simplified(closed: Any) -> Any:
         if any(id(a) in used for a in e.outvars):
             used.update(map(id, e.invars))
             kept.append(e)
-    return closed.replace(jaxpr=jaxpr.replace(eqns=kept[::-1], outvars=outvars))
+    return closed.replace(jaxpr=jaxpr.replace(eqns=_prepared_once(kept[::-1]), outvars=outvars))
+
+
+def _prepared_once(equations: Sequence[Any]) -> list[Any]:
+    """Return calls of a module without the preparations of the call before; all that are left are run."""
+    found, prepared = [], None
+    for e in equations:
+        if e.primitive is call_p and len((call := e.params["call"]).functions) > 1:
+            now = call.functions[:-1], tuple(map(id, e.invars[: call.first]))
+            if now == prepared:
+                e = e.replace(params={"call": call._replace(functions=call.functions[-1:])})
+            prepared = now
+        elif _has_calls(e):
+            prepared = None
+        found.append(e)
+    return found
 
 
 def _has_calls(equation: Any) -> bool:
