@@ -9,6 +9,7 @@ from jax import lax
 from tests.expressions.test_read import FUNCTIONS as READ
 from udkjax.expressions import Differential, Graph, ScalarProgram, cotangents, tangents, trace
 from udkjax.expressions.algebra.differential import common_factors
+from udkjax.expressions.algebra.node_derivatives import ActiveNodes
 
 X, Y = np.array([0.3, -0.7, 1.1]), np.array([0.5, 0.9, -0.4])
 FUNCTIONS = {
@@ -103,3 +104,49 @@ def test_a_factor_that_a_column_has_in_common_is_taken_out(graph, xyz):
     assert rows == [{0: x, 1: x}, {0: -z, 2: y}, {1: y, 2: x}]
     assert common_factors([{0: x * y}, {0: y * z}], {(y * z).index}) == ([{0: x * y}, {0: y * z}], {})
     assert common_factors([{0: x * y}]) == ([{0: x * y}], {})
+
+
+def node_by_node(graph, outputs, inputs):
+    """Tangents of functions and cotangents of inputs, with seeds as inputs."""
+    nodes = ActiveNodes(graph, outputs, inputs)
+    dots = [graph.input(("d", k), "tangent") for k in range(len(inputs))]
+    bars = [graph.input(("bar", k), "cotangent") for k in range(len(outputs))]
+    return (nodes, [*inputs, *dots], nodes.push_forward(dots)), (nodes, [*inputs, *bars], nodes.pull_back(bars))
+
+
+@pytest.mark.parametrize("name", ["quotients", "powers", "choice", "branch", "loop", "indices", "roots", "trigonometry"])
+def test_passes_from_node_to_node_are_those_of_jax(name):
+    """Whatever takes fewer operations is chosen; here they are taken in any case, with inputs of either sign."""
+    graph, function = Graph(), FUNCTIONS[name]
+    given = [graph.input(k, "state") for k in range(6)]
+    inputs = [-s if k % 2 else s for k, s in enumerate(given)]
+    flat = lambda z: jnp.concatenate([jnp.ravel(o) for o in jax.tree.leaves(function(z[:3], z[3:]))])  # noqa: E731
+    outputs = list(trace(flat, jnp.zeros(6))(graph, np.asarray(inputs, object))[0])
+    random, at = np.random.default_rng(1), np.concatenate([X, Y])
+    dots, weights = random.standard_normal(6), random.standard_normal(len(outputs))
+    (_, forward, moved), (_, backward, pulled) = node_by_node(graph, outputs, inputs)
+    signs = [s.sign for s in inputs]
+    of_nodes = [float(a * sign) for a, sign in zip(at, signs, strict=True)]
+    found = ScalarProgram(graph, [*given, *forward[6:]], moved)([*of_nodes, *dots.tolist()])
+    np.testing.assert_allclose(found, jax.jvp(flat, (at,), (dots,))[1], rtol=1e-12, atol=1e-13)
+    found = ScalarProgram(graph, [*given, *backward[6:]], pulled)([*of_nodes, *weights.tolist()])
+    np.testing.assert_allclose(found, jax.vjp(flat, at)[1](weights)[0], rtol=1e-12, atol=1e-13)
+
+
+def test_the_solution_of_a_sparse_system_is_not_differentiated_as_a_dense_matrix():
+    """Derivatives of a tridiagonal solution by its right-hand side take as many operations as the solution, at twice the size twice."""
+
+    def count(size):
+        graph = Graph()
+        below, b = ([graph.input((name, k), name) for k in range(size)] for name in ("below", "b"))
+        x = [b[0]]
+        for k in range(1, size):
+            x.append(b[k] - below[k] * x[-1])
+        for k in range(size - 2, -1, -1):
+            x[k] = x[k] - below[k + 1] * x[k + 1]
+        seeds = [graph.input(("seed", k), "tangent") for k in range(size)]
+        found = tangents(graph, x, dict(zip(b, seeds, strict=True))), cotangents(graph, x, seeds, b)
+        return [sum(ScalarProgram(graph, [*below, *seeds], outputs).count().values()) for outputs in found]
+
+    assert count(20) == [4 * 19] * 2
+    assert count(40) == [4 * 39] * 2

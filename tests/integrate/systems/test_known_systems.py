@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
 
 import udkjax as udk
-from experiments.parts import closed_chains
+from experiments.parts import closed_chains, stewart
 from tests.integrate.systems import own_systems
 from tests.integrate.systems.own_systems import G
 
@@ -149,6 +149,21 @@ def test_the_benchmark_a04():
     energy = udk.energy(system, solution)
     assert np.ptp(energy.total) < 1e-9 * energy.kinetic.max()
     assert udk.diagnose(system, udk.State(solution.q[0], solution.v[0])).degrees_of_freedom == 1
+
+
+@pytest.mark.slow
+def test_a_stewart_platform():
+    """Thirteen bodies with 12 rows too many, beside Lagrange's equations of the platform's six coordinates."""
+    ts, pose = np.linspace(0.0, 0.4, 5), np.array([0.05, -0.03, 0.95, 0.1, -0.15, 0.2])
+    rest = np.asarray(stewart.lengths(jnp.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0])))
+    system, q = stewart.system(rest), np.asarray(stewart.bodies(jnp.asarray(pose)))
+    solution = run(system, q, 0 * q, ts)
+    expected = np.stack([stewart.bodies(y) for y in stewart.poses(pose, rest, ts)])
+    assert np.ptp(expected[:, -7:], axis=0).min() > 1e-3  # all coordinates of the platform move
+    assert_allclose(solution.q, expected, rtol=0, atol=1e-11)
+    assert_allclose(udk.violation(system, solution), 0.0, atol=1e-14)
+    found = udk.diagnose(system, udk.State(q, 0 * q))
+    assert (found.degrees_of_freedom, len(found.redundant)) == (6, 12)
 
 
 @pytest.mark.slow

@@ -16,9 +16,12 @@ from benchmarks.systems import spatial_chain
 from tests.fresh_process import python
 from tests.integrate.systems.own_systems import G, pendulum
 from udkjax.equations import equations_of
+from udkjax.equations.programs.unrolled import Unrolled
 from udkjax.equations.systems.general import prepare_general
+from udkjax.equations.systems.system_programs import system_programs
 from udkjax.equations.systems.system_solver import factorize_mass, mass_operations
 from udkjax.equations.systems.traced_system import trace_system
+from udkjax.expressions.loops.loop_derivative import FORWARD, REVERSE
 from udkjax.integrate.compiled_mechanism import compile_mechanism
 from udkjax.integrate.native_engine import mark_rows
 from udkjax.integrate.native_equations import native_equations
@@ -376,6 +379,20 @@ for function in (lambda: udk.diagnose(system), lambda: udk.simulate(system, ts, 
         print("leave JAX_ENABLE_X64 unset" in str(error))
 """
     assert python(code, JAX_ENABLE_X64="0").split() == ["float32", "True", "True", "True", "True"]
+
+
+@pytest.mark.parametrize("mode", [FORWARD, REVERSE])
+def test_derivatives_of_a_chain_grow_as_its_length(mode):
+    """The solution of the equations passes tangents from body to body; its Jacobian would have an entry for each pair of bodies."""
+
+    def operations(rods):
+        system = trace_system(spatial_chain(rods)[0], 7 * rods)
+        programs = system_programs(system, False)
+        both = Unrolled(programs, [], [("a",)], [False] * programs.number_count, mode).derivative("a")
+        return np.array([len(x.program.order) for x in both])
+
+    short, long = operations(2), operations(4)
+    assert np.all(long < 2.3 * short)
 
 
 @pytest.mark.slow

@@ -4,16 +4,19 @@ A differential is a linear combination of the differentials of the inputs, d f =
 partial derivatives are expressions of the same graph: a cosine that they share with the function is one node, and zeros vanish.
 The same partial derivatives serve any number of directions at once and, transposed, reverse mode.
 
+A function with many inputs and outputs may take fewer operations than its Jacobian has entries, as the solution of a sparse linear
+system does for its right-hand side. Tangents then pass from node to node, and cotangents back (node_derivatives.py).
+
 Results of an opaque node (an array primitive, `call`) count as additional inputs. Their differentials follow from those of its
 arguments by JAX's rule for the primitive, forward or transposed.
 """
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from functools import lru_cache
 
 import jax
 import numpy as np
 
+from udkjax.expressions.algebra.node_derivatives import ActiveNodes, partial_derivative
 from udkjax.expressions.reading.jaxpr_reader import ClosedJaxpr, read_jaxpr
 from udkjax.expressions.scalars.graph import BoundPrimitive, Graph, Node, Scalar
 
@@ -77,7 +80,7 @@ class Differential:
         for k, argument in enumerate(node.arguments):
             row = self.row(argument)
             if row:
-                accumulate(result, row, _partial(graph, index, node, k))
+                accumulate(result, row, partial_derivative(graph, index, node, k))
         return {k: p for k, p in result.items() if not p.is_zero}
 
     def _differentiate_choice(self, node: Node) -> SparseRow:
@@ -104,6 +107,9 @@ def tangents(
     Returns:
         The tangent of each output.
     """
+    nodes = ActiveNodes(graph, outputs, list(seeds))
+    if nodes.are_fewer:
+        return nodes.push_forward(list(seeds.values()))
     differential = Differential(graph, outputs, list(seeds))
     tangents_of_nodes = differential.forward({s.index: t if s.sign > 0 else -t for s, t in seeds.items()})
     rows, factors = _factored(differential, outputs, given)
@@ -130,6 +136,9 @@ def cotangents(
     Returns:
         The cotangent of each input.
     """
+    nodes = ActiveNodes(graph, outputs, inputs)
+    if nodes.are_fewer:
+        return nodes.pull_back(seeds)
     differential, result = Differential(graph, outputs, inputs), {}
     rows, factors = _factored(differential, outputs, given)
     for row, seed in zip(rows, seeds, strict=True):
@@ -185,38 +194,7 @@ def _without(entry: Scalar, factor: Scalar) -> Scalar:
     return quotient if entry.sign > 0 else -quotient
 
 
-def _partial(graph: Graph, index: int, node: Node, k: int) -> Scalar:
-    """Return the derivative of a node with respect to its k-th argument."""
-    one, value = graph.constant(1.0, node.dtype), Scalar(graph, index)
-    match node.kind:
-        case "add":
-            return one
-        case "sub":
-            return one if k == 0 else -one
-        case "mul":
-            return node.arguments[1 - k]
-        case "div":
-            reciprocal = one / node.arguments[1]
-            return reciprocal if k == 0 else -(value * reciprocal)
-        case "sqrt":
-            return graph.constant(0.5, node.dtype) / value
-    detail, dtypes = node.detail, tuple(a.node.dtype for a in node.arguments)
-    (slope,) = read_jaxpr(graph, _slope(detail, dtypes, k), [np.asarray(a, object) for a in node.arguments])
-    return slope.item()
-
-
 # --- by JAX's rules
-
-
-@lru_cache(maxsize=256)
-def _slope(detail: BoundPrimitive, dtypes: tuple[np.dtype, ...], k: int) -> ClosedJaxpr:
-    """Return the derivative of a primitive on scalars with respect to its k-th argument, as a jaxpr."""
-
-    def slope(*scalars):
-        f = lambda x: detail.primitive.bind(*scalars[:k], x, *scalars[k + 1 :], **detail.parameters)  # noqa: E731
-        return jax.jvp(f, (scalars[k],), (np.ones((), dtypes[k]),))[1]
-
-    return jax.make_jaxpr(slope)(*(jax.ShapeDtypeStruct((), d) for d in dtypes))
 
 
 def _push_forward(graph: Graph, call: int, results: Sequence[int], tangents: Sequence[Scalar]) -> SparseRow:

@@ -260,7 +260,11 @@ class Graph:
         return Scalar(self, self._operation(node.kind, tuple(arguments), node.detail, node.dtype))
 
     def _operation(self, kind, arguments, detail=None, dtype=None) -> int:
-        depends = frozenset().union(*[self.nodes[a.index].depends for a in arguments])
+        depends: frozenset[str] = frozenset()
+        for a in arguments:
+            more = self.nodes[a.index].depends
+            if more is not depends and not more <= depends:  # most are, and need no new set
+                depends = more if depends <= more else depends | more
         return self._node(kind, arguments, detail, dtype or arguments[0].node.dtype, depends)
 
     def _node(self, kind, arguments, detail, dtype, depends) -> int:

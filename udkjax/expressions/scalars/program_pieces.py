@@ -64,6 +64,7 @@ def pieces_of(program: ScalarProgram, late: Collection[int] = (), longest: int =
                 places[index] = passed[index] = free.pop()
         free += [place for index, place in received.items() if until[index] == k]
         # Constants that an earlier piece has computed
-        constants = [i for i in reads[k] if i not in made and i not in given and i not in {*part}]
+        own = {*part}
+        constants = [i for i in reads[k] if i not in made and i not in given and i not in own]
         pieces.append(ProgramPiece([*sorted(constants), *part], {i for i in reads[k] if i in given}, received, passed, stored[k]))
     return pieces, size

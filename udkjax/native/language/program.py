@@ -4,9 +4,9 @@ Inputs and outputs are in memory, with the W lanes of each number contiguous.
 """
 
 import math
-from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from functools import cached_property
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -63,9 +63,10 @@ def write(
     pieces, shared = pieces_of(program, [k for k, place in enumerate(outputs) if place in read], longest)
     widest = max(lanes.values(), default=width)
     kinds: dict[int, tuple[str, int]] = {}  # the type and the lanes of values that pieces pass
+    read_again = nodes_read_again(program)  # once for all pieces
 
     def fill(f: Function, piece: ProgramPiece, passed: Value):
-        writer = Writer(f, program)
+        writer = Writer(f, program, read_again)
         for s in program.inputs:
             if s.index in piece.inputs:
                 pointer, place = places[s.index]
@@ -112,11 +113,24 @@ def from_memory(f: Function, x: Value, dtype: Any) -> Value:
     return f.op(f"fptosi {x.type} {x.name} to {llvm_type(INT, x.width)}", INT, x.width) if dtype.kind in "iu" else x
 
 
-class Writer:
-    """The operations of a program within a function; the values of inputs must be set in `values` first."""
+def nodes_read_again(program: ScalarProgram) -> set[int]:
+    """Return the nodes that are read more than once, by operations or as outputs."""
+    nodes = program.graph.nodes
+    read, again = set[int](), set[int]()
+    for s in chain(chain.from_iterable(nodes[index].arguments for index in program.order), program.outputs):
+        (again if s.index in read else read).add(s.index)
+    return again
 
-    def __init__(self, f: Function, program: ScalarProgram):
+
+class Writer:
+    """The operations of a program within a function; the values of inputs must be set in `values` first.
+
+    `read_again` may be the nodes that are read more than once, where several writers write one program.
+    """
+
+    def __init__(self, f: Function, program: ScalarProgram, read_again: Collection[int] | None = None):
         self.f, self.program, self.values = f, program, {}
+        self._given = read_again
         self._negative: dict[int, Value] = {}
         self._pairs: dict[str, tuple[Value, Value]] = {}
 
@@ -126,18 +140,15 @@ class Writer:
         return self.outputs(range(len(self.program.outputs)))
 
     @cached_property
-    def _uses(self) -> Counter[int]:
-        nodes = self.program.graph.nodes
-        used = Counter(s.index for index in self.program.order for s in nodes[index].arguments)
-        used.update(s.index for s in self.program.outputs)
-        return used
+    def _read_again(self) -> Collection[int]:
+        return nodes_read_again(self.program) if self._given is None else self._given
 
     def compute(self, order: Sequence[int]) -> None:
         """Write some operations."""
         nodes = self.program.graph.nodes
         for index in order:
             self.values[index] = result = self._operation(nodes[index])
-            if self._uses[index] > 1:  # fused with several sums, a product would occupy two registers instead of one
+            if index in self._read_again:  # fused with several sums, a product would occupy two registers instead of one
                 result.product = None
 
     def outputs(self, chosen: Iterable[int]) -> list[Value]:
