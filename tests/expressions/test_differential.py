@@ -134,7 +134,7 @@ def test_passes_from_node_to_node_are_those_of_jax(name):
 
 
 def test_the_solution_of_a_sparse_system_is_not_differentiated_as_a_dense_matrix():
-    """Derivatives of a tridiagonal solution by its right-hand side take as many operations as the solution, at twice the size twice."""
+    """Derivatives of a bidiagonal solution by its right-hand side take as many operations as the solution."""
 
     def count(size):
         graph = Graph()

@@ -383,7 +383,7 @@ for function in (lambda: udk.diagnose(system), lambda: udk.simulate(system, ts, 
 
 @pytest.mark.parametrize("mode", [FORWARD, REVERSE])
 def test_derivatives_of_a_chain_grow_as_its_length(mode):
-    """The solution of the equations passes tangents from body to body; its Jacobian would have an entry for each pair of bodies."""
+    """The solution of the equations passes tangents from body to body; its Jacobian has an entry for each pair of bodies."""
 
     def operations(rods):
         system = trace_system(spatial_chain(rods)[0], 7 * rods)

@@ -4,8 +4,8 @@ A differential is a linear combination of the differentials of the inputs, d f =
 partial derivatives are expressions of the same graph: a cosine that they share with the function is one node, and zeros vanish.
 The same partial derivatives serve any number of directions at once and, transposed, reverse mode.
 
-A function with many inputs and outputs may take fewer operations than its Jacobian has entries, as the solution of a sparse linear
-system does for its right-hand side. Tangents then pass from node to node, and cotangents back (node_derivatives.py).
+A function of many inputs may take fewer operations than its Jacobian has entries, as the solution of a sparse linear system does
+for its right-hand side. Tangents then pass from node to node, and cotangents back (node_derivatives.py).
 
 Results of an opaque node (an array primitive, `call`) count as additional inputs. Their differentials follow from those of its
 arguments by JAX's rule for the primitive, forward or transposed.
@@ -17,7 +17,7 @@ import jax
 import numpy as np
 
 from udkjax.expressions.algebra.node_derivatives import ActiveNodes, partial_derivative
-from udkjax.expressions.reading.jaxpr_reader import ClosedJaxpr, read_jaxpr
+from udkjax.expressions.reading.jaxpr_reader import read_jaxpr
 from udkjax.expressions.scalars.graph import BoundPrimitive, Graph, Node, Scalar
 
 SparseRow = dict[int, Scalar]  # partial derivatives by the index of the variable's node
