@@ -116,7 +116,7 @@ def node_by_node(graph, outputs, inputs):
 
 @pytest.mark.parametrize("name", ["quotients", "powers", "choice", "branch", "loop", "indices", "roots", "trigonometry"])
 def test_passes_from_node_to_node_are_those_of_jax(name):
-    """Whatever takes fewer operations is chosen; here they are taken in any case, with inputs of either sign."""
+    """The way that takes fewer operations is chosen; here both passes are taken in any case, with inputs of either sign."""
     graph, function = Graph(), FUNCTIONS[name]
     given = [graph.input(k, "state") for k in range(6)]
     inputs = [-s if k % 2 else s for k, s in enumerate(given)]

@@ -105,6 +105,10 @@ class ProjectionPart(Part):
         """Return one register of how far positions are from the integral of v at the time `next`."""
         raise NotImplementedError
 
+    def drift(self, f: Function) -> Value | None:
+        """Return the violation of Psi at the end of an attempted step, relative to the rows' scales; None if it is rounding."""
+        return None
+
     def judge(self, f: Function, s: Lane, accept: Value, lost: Variable):
         """Set `lost` to the status of lanes whose new point ends their run."""
 

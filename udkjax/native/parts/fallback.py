@@ -115,7 +115,7 @@ class RankRevealing(FallbackPart):
         return not self._in.friction.settles
 
     def limit_of_error(self, f: Function, s: Lane, time_left: Value) -> Value | float:
-        return limit_of_error(f, s, self._in.method, time_left) if self._plans else 1.0
+        return limit_of_error(f, s, self._in.method, time_left, self._in.projection.drift(f)) if self._plans else 1.0
 
     def step_around(
         self, f: Function, s: Lane, accept: Value, lanes: Callable[[], Value], time_left: Value, step: Value, otherwise: Value

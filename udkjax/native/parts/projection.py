@@ -47,6 +47,9 @@ class Unprojected(ProjectionPart):
             module.put(f, "result v", r, module.vector(f, "state v", r))
         s.violated = largest_violation(module, f)
 
+    def drift(self, f: Function) -> Value | None:
+        return largest_violation(self._in, f) if self._in.m else None
+
     def judge(self, f: Function, s: Lane, accept: Value, lost: Variable):
         if self._in.m:
             lost.value = self._drifted(f, s, accept)

@@ -40,8 +40,10 @@ def retry_or_fall_back(f: Function, s: Lane, failed: Value, tries: Value | None)
     return stepping & ~fallback_due, shortens, time_left
 
 
-def limit_of_error(f: Function, s: Lane, method: Method, time_left: Value) -> Value:
+def limit_of_error(f: Function, s: Lane, method: Method, time_left: Value, drift: Value | None) -> Value:
     """Return the error up to which a step is accepted: one or, across a singular configuration, its rounding error if larger.
+
+    A violation of the constraints, `drift`, turns the velocity as a rounding error of this size does.
 
     A shorter step across the singular configuration would have a larger rounding error, as its nodes are nearer to it. The run
     would creep there by ever shorter steps, whose errors add up to much more, and leave out rows that are independent. This only
@@ -52,7 +54,8 @@ def limit_of_error(f: Function, s: Lane, method: Method, time_left: Value) -> Va
     is_certain = f.abs(straight - time_left) < s.step * method.clearance
     crosses = (s.fallback > 0.5) & (s.begin < 0.5) & (time_left > 0.0) & (time_left < s.step) & is_certain
     nearest = s.distance2 * (s.step * method.clearance / f.select(crosses, time_left, 1.0))
-    rounding = ROUNDING_ACROSS / (nearest * nearest * s.tolerance)
+    size = f.const(ROUNDING_ACROSS, DOUBLE, f.width) if drift is None else f.max(drift, ROUNDING_ACROSS)
+    rounding = size / (nearest * nearest * s.tolerance)
     return f.select(crosses, f.max(rounding, 1.0), 1.0)
 
 
