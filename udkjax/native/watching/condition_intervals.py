@@ -25,6 +25,8 @@ def write_classification(module: WatchMemory):
     hits = [f.variable(0.0), f.variable(0.0)]
     steps = (s.middle_t - s.first_t, s.look - s.middle_t)
     x = steps[0] / length
+    # Friction may jam the mechanism in a range that a step across a singular configuration passes, where only its ends are states.
+    leaps = (s.fallback > 0.5) if module.friction.settles else f.const(False, BOOL, f.width)
     with f.each(module.conditions.count) as c:
         g = [module.condition(f, name, c) for name in ("g0", "g1", "g")]
         rate = [module.condition(f, name, c) for name in ("rate0", "rate1", "rate")]
@@ -41,7 +43,7 @@ def write_classification(module: WatchMemory):
         for k in range(2):
             after = f.select(f.abs(g[k + 1]) <= floor, side, _sign(f, g[k + 1]))
             hit, is_certain = _classify_interval(f, (g[k], rate[k], g[k + 1], rate[k + 1]), steps[k], error, side, after, floor)
-            is_unclear = on & ~(is_certain & is_smooth)
+            is_unclear = on & ~(is_certain & is_smooth) & ~leaps
             direction = module.condition(f, "direction", c)
             counts = hit & on & (direction.is_(0.0) | direction.is_(after))
             fault = f.select(is_finite, f.select(is_unclear, f.const(VARIES_FAST, DOUBLE, f.width), 0.0), UNDEFINED)

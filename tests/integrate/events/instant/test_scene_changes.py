@@ -328,8 +328,14 @@ def test_a_lock_that_would_have_to_stop_a_driver_is_impossible_whichever_row_is_
         assert (sol.result, round(float(sol.time), 9)) == (udk.Result.event_impossible, 0.1), pin
 
 
-@pytest.mark.parametrize("slant", [0.1, 1e-2, 1e-3])
-@pytest.mark.parametrize("engine", ["native", pytest.param("diffrax", marks=pytest.mark.slow)])
+# The plain form leaves out rows whose distance from dependence is below 1e-3 (`BRANCH_TOL`), and refuses to attach such a joint.
+SLANTS = {"native": [0.1, 1e-2, 1e-3], "diffrax": [0.1, 1e-2, 2e-3]}
+
+
+@pytest.mark.parametrize(
+    ("engine", "slant"),
+    [pytest.param(x, s, marks=[pytest.mark.slow] * (x == "diffrax")) for x, slants in SLANTS.items() for s in slants],
+)
 def test_a_joint_that_stops_its_own_condition_is_attached_once(slant, engine):
     """A rod between parallel cranks stops them, with a singular value that is as small as the rod is nearly parallel to them.
 
