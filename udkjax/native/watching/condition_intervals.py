@@ -25,7 +25,7 @@ def write_classification(module: WatchMemory):
     hits = [f.variable(0.0), f.variable(0.0)]
     steps = (s.middle_t - s.first_t, s.look - s.middle_t)
     x = steps[0] / length
-    # Friction may jam the mechanism in a range that a step across a singular configuration passes, where only its ends are states.
+    # Friction may jam the mechanism in a range that a step across a singular configuration passes: only its ends are states.
     leaps = (s.fallback > 0.5) if module.friction.settles else f.const(False, BOOL, f.width)
     with f.each(module.conditions.count) as c:
         g = [module.condition(f, name, c) for name in ("g0", "g1", "g")]
