@@ -24,8 +24,8 @@ EquationRule = Callable[["Lowering", Any, list[Array]], list[Array]]
 
 
 def traced(function: Callable[..., Any], given: Sequence[jax.ShapeDtypeStruct]) -> Any:
-    """Return the jaxpr of a function, which is the same within other traces of JAX and outside: constants are folded."""
-    with jax.ensure_compile_time_eval():
+    """Return the jaxpr of a function, the same within other traces of JAX, outside, and without `jit`: constants are folded."""
+    with jax.ensure_compile_time_eval(), jax.disable_jit(False):  # without `jit`, loops would be repeated in the text
         return jax.make_jaxpr(function)(*given)
 
 
