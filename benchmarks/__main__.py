@@ -15,6 +15,7 @@ NAMES = (
     "gradients",
     "stiff",
     "friction",
+    "events",
     "systems",
     "mechanisms",
     "startup",
