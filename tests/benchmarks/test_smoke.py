@@ -59,6 +59,7 @@ SMALL = {  # what must be true of the figures of a small run; most hold their pr
         and 1 < rows[1]["times_operations"] < 4
         and all(row["times_run"] > 0 for row in rows)
     ),
+    "events": lambda rows: names(rows) == ["a limit"] and rows[0]["us_each"] > 0 and 0 < rows[0]["share of machine code"] < 1,
     "systems": lambda rows: names(rows)[0] == "spatial pendulum" and all(row["apart"] < 1e-2 for row in rows),
     "mechanisms": lambda rows: (
         all(row.get("per_second", row.get("ms", 0.0)) > 0 for row in rows)
