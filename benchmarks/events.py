@@ -1,4 +1,4 @@
-"""What an event costs, by the parts of the program that its time is spent in, beside the same run without events."""
+"""The cost of an event, by the parts of the program in which its time is spent, beside the same run without events."""
 
 import sys
 import threading
