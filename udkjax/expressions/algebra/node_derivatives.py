@@ -47,7 +47,8 @@ class ActiveNodes:
             node = self._graph.nodes[index]
             if _is_choice(node):
                 which, *cases = node.arguments
-                tangents = [_signed(found.get(a.index, zero), a) for a in cases]
+                still = self._graph.constant(0.0, node.dtype)
+                tangents = [_signed(found.get(a.index, still), a) for a in cases]
                 found[index] = _choose(self._graph, node, which, tangents)
             else:
                 found[index] = sum(
@@ -73,9 +74,10 @@ class ActiveNodes:
             node, cotangent = self._graph.nodes[index], found.pop(index)
             if _is_choice(node):
                 which, *cases = node.arguments
+                still = self._graph.constant(0.0, node.dtype)
                 for k, a in enumerate(cases):
                     if a.index in self._active:
-                        parts = [cotangent if i == k else zero for i in range(len(cases))]
+                        parts = [cotangent if i == k else still for i in range(len(cases))]
                         add(a, _choose(self._graph, node, which, parts))
             else:
                 for a, slope in self._slopes(index, node):
