@@ -99,6 +99,7 @@ def main(smoke: bool = False) -> list[dict[str, Any]]:
         ts = np.linspace(0.0, end, 11)
         run = partial(udk.simulate, mech, ts, events=events or None)
         found = run()
+        assert found.events is not None, name
         count = int(found.events.count)
         assert count > 3, name
         runs = {"with": run, "without": partial(udk.simulate, free, ts)}

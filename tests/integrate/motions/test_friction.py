@@ -60,7 +60,7 @@ def test_a_jam_is_named_after_an_event_and_where_steps_run_out():
     mechanism = rubbing(udk.library.n_four_bar(1), 0.15, 0.005)
     watch = udk.Event(lambda t, at: t - 0.2, udk.Log(), name="log")
     solution = udk.simulate(mechanism, [0.0, 0.4, 4.0], events=[watch], throw=False, max_steps=100, rtol=1e-10, atol=1e-10)
-    assert solution.events.count == 1 and solution.result == udk.Result.step_limit
+    assert solution.events is not None and solution.events.count == 1 and solution.result == udk.Result.step_limit
     assert "steps was reached: friction jams joints" in solution.cause
 
 

@@ -243,4 +243,4 @@ def test_an_unused_change_prepares_nothing():
     """The call that is left out is the one that would have factored the rows."""
     scene, ts = udk.library.four_bar(), np.linspace(0.0, 1.0, 3)
     runs = [udk.simulate(scene, ts, stabilization=x, engine="native").q for x in (BraunGoldfarb(), Unused())]
-    np.testing.assert_array_equal(*runs)
+    np.testing.assert_array_equal(runs[0], runs[1])

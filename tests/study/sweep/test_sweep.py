@@ -58,8 +58,7 @@ def data(plan, finished):
 def test_each_member_is_as_by_itself(data, pendulum, reference):
     for i, j, k in ((0, 0, 0), (2, 1, 0), (1, 1, 1)):
         mechanism = pendulum.with_parameters({"body.rod.mass": MASSES[i]})
-        choices = {"rtol": TOLERANCES[j], "atol": TOLERANCES[j]}
-        solution = udk.simulate(mechanism, TS * AXES["t1"][k], **choices)
+        solution = udk.simulate(mechanism, TS * AXES["t1"][k], rtol=TOLERANCES[j], atol=TOLERANCES[j])
         member = data.isel(mass=i, tol=j, t1=k)
         assert int(member.result) == 0 and int(member.end_time == AXES["t1"][k])
         assert int(member.steps) == int(solution.stats["steps"]) and int(member.accepted) == int(solution.stats["accepted"])
