@@ -140,9 +140,9 @@ def test_a_curve_is_drawn_by_mechanisms_shown_and_written(tmp_path, capsys):
     assert udkjax("design", "--curve", file, *options) == 0
     best = json.loads(capsys.readouterr().out)["designs"][0]
     assert best["error"] < 0.1 and best["bars"] == 4 and best["turns"] and best["size"] < 0.2
-    mechanism = udk.load(tmp_path / "out" / "design1.toml")
-    assert dict(mechanism.drawing.units) == {"length": "mm"}
-    np.testing.assert_allclose(mechanism.drawing.pins["O"], best["pins"]["O"], atol=1e-12)
+    drawing = udk.load(tmp_path / "out" / "design1.toml").drawing
+    assert drawing is not None and dict(drawing.units) == {"length": "mm"}
+    np.testing.assert_allclose(drawing.pins["O"], best["pins"]["O"], atol=1e-12)
     assert "<html" in (tmp_path / "out" / "design1.html").read_text()[:200]
 
 
