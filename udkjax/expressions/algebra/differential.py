@@ -16,7 +16,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 import jax
 import numpy as np
 
-from udkjax.expressions.algebra.node_derivatives import ActiveNodes, partial_derivative
+from udkjax.expressions.algebra.node_derivatives import ActiveNodes, choose, is_choice, partial_derivative
 from udkjax.expressions.reading.jaxpr_reader import read_jaxpr
 from udkjax.expressions.scalars.graph import BoundPrimitive, Graph, Node, Scalar
 
@@ -74,7 +74,7 @@ class Differential:
                 return {}
             self._calls.setdefault(call.index, []).append(index)
             return {index: graph.constant(1.0, node.dtype)}
-        if node.kind == "apply" and node.detail.primitive.name == "select_n":
+        if is_choice(node):
             return self._differentiate_choice(node)
         result: SparseRow = {}
         for k, argument in enumerate(node.arguments):
@@ -86,10 +86,8 @@ class Differential:
     def _differentiate_choice(self, node: Node) -> SparseRow:
         which, *cases = node.arguments
         rows, zero = [self.row(a) for a in cases], self.graph.constant(0.0, node.dtype)
-        parts = {k: (which, *(row.get(k, zero) for row in rows)) for row in rows for k in row}
-        choose = lambda *values: values[1 + int(values[0])]  # noqa: E731
-        detail = node.detail
-        return {k: self.graph.apply(detail.primitive, detail.parameters, p, node.dtype, choose) for k, p in parts.items()}
+        parts = {k: [row.get(k, zero) for row in rows] for row in rows for k in row}
+        return {k: choose(self.graph, node, which, p) for k, p in parts.items()}
 
 
 def tangents(

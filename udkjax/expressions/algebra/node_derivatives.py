@@ -45,11 +45,11 @@ class ActiveNodes:
         found = {s.index: _signed(t, s) for s, t in zip(self._inputs, seeds, strict=True)}
         for index in self._order:
             node = self._graph.nodes[index]
-            if _is_choice(node):
+            if is_choice(node):
                 which, *cases = node.arguments
                 still = self._graph.constant(0.0, node.dtype)
                 tangents = [_signed(found.get(a.index, still), a) for a in cases]
-                found[index] = _choose(self._graph, node, which, tangents)
+                found[index] = choose(self._graph, node, which, tangents)
             else:
                 found[index] = sum(
                     (slope * _signed(found[a.index], a) for a, slope in self._slopes(index, node)), self._graph.constant(0.0)
@@ -72,13 +72,13 @@ class ActiveNodes:
             if index not in found:
                 continue
             node, cotangent = self._graph.nodes[index], found.pop(index)
-            if _is_choice(node):
+            if is_choice(node):
                 which, *cases = node.arguments
                 still = self._graph.constant(0.0, node.dtype)
                 for k, a in enumerate(cases):
                     if a.index in self._active:
                         parts = [cotangent if i == k else still for i in range(len(cases))]
-                        add(a, _choose(self._graph, node, which, parts))
+                        add(a, choose(self._graph, node, which, parts))
             else:
                 for a, slope in self._slopes(index, node):
                     add(a, slope * cotangent)
@@ -95,13 +95,15 @@ def _signed(x: Scalar, a: Scalar) -> Scalar:
     return x if a.sign > 0 else -x
 
 
-def _is_choice(node: Node) -> bool:
+def is_choice(node: Node) -> bool:
+    """Return whether a node is one of several cases."""
     return node.kind == "apply" and node.detail.primitive.name == "select_n"
 
 
-def _choose(graph: Graph, node: Node, which: Scalar, cases: Sequence[Scalar]) -> Scalar:
-    choose = lambda *values: values[1 + int(values[0])]  # noqa: E731
-    return graph.apply(node.detail.primitive, node.detail.parameters, (which, *cases), node.dtype, choose)
+def choose(graph: Graph, node: Node, which: Scalar, cases: Sequence[Scalar]) -> Scalar:
+    """Return the choice of a node, `which`, among other cases."""
+    fold = lambda *values: values[1 + int(values[0])]  # noqa: E731
+    return graph.apply(node.detail.primitive, node.detail.parameters, (which, *cases), node.dtype, fold)
 
 
 def partial_derivative(graph: Graph, index: int, node: Node, k: int) -> Scalar:

@@ -74,7 +74,7 @@ def simplified(closed: Any) -> Any:
 
 
 def _prepared_once(equations: Sequence[Any]) -> list[Any]:
-    """Return calls of a module without the preparations of the call before; all that are left are run."""
+    """Return equations in which no call of a module repeats the preparations of the call before it; none may be dropped later."""
     found, prepared = [], None
     for e in equations:
         if e.primitive is call_p and len((call := e.params["call"]).functions) > 1:
