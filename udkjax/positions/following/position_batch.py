@@ -87,7 +87,7 @@ class PositionBatch:
     def __call__(
         self,
         parameters: Mapping[str, Float[ArrayLike, "M ..."]],
-        values: Float[ArrayLike, "T"] | Float[ArrayLike, "M T"],
+        values: Float[ArrayLike, "T"] | Float[ArrayLike, "M T"] | Sequence[float],
         threads: int | None = None,
     ) -> BatchPositions:
         """Return the positions of all members over the values of the driver.

@@ -7,7 +7,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import ArrayLike, Float
 
-from udkjax.annotations import NumberLike, Numbers
+from udkjax.annotations import NumberLike, NumericArray
 from udkjax.argument_types import BY_NAME, HISTORY, NUMBERS_BY_NAME, ArgumentRequirement, of_kind
 from udkjax.arrays import is_traced, without_derivatives
 from udkjax.positions.answers.counting import Count
@@ -70,8 +70,8 @@ class LeastGap(NamedTuple):
     value: float
     distance: Any
     bound: float
-    points: Numbers
-    q: Numbers
+    points: Float[NumericArray, "2 2"]
+    q: Float[NumericArray, "bodies 3"]
 
     _units = units(distance="m", bound="m", points="m", q="m, m, rad")
 
