@@ -54,8 +54,8 @@ def in_c(name: str, mechanism: Any, end: float) -> dict[str, Any]:
 
 def as_fmu(name: str, mechanism: Any, end: float) -> dict[str, Any]:
     """Return the complaints of FMPy, the difference of co-simulation from a chain of steps, and the error of model exchange."""
-    import fmpy
-    from fmpy.validation import validate_fmu
+    import fmpy  # pyright: ignore[reportMissingImports]
+    from fmpy.validation import validate_fmu  # pyright: ignore[reportMissingImports]
 
     import udkjax as udk
 

@@ -21,7 +21,7 @@ import xarray
 from matplotlib.figure import Figure
 
 from experiments.common import HERE, described, panels, tracked
-from experiments.parts.curve_runs import BARS, SEGMENTS, TIMES, by_bfgs, search, stored
+from experiments.parts.curve_runs import BARS, SEGMENTS, TIMES, Result, by_bfgs, search, stored
 from experiments.parts.curve_sets import LETTERS, classic_curves, curves_of_mechanisms, letter
 from udkjax.show.plots import COLOURS
 from udkjax.synthesis.curves.linkage_drawing import CLOSED_TO
@@ -40,7 +40,7 @@ def study(
     letters, seeded, folder = ("L", "L", None) if smoke else (LETTERS, SEEDED, KEPT / str(rounds))
     classics, seeds, linkages = (0, 2, 1) if smoke else (classics, seeds, linkages)
     curves = {name: letter(name) for name in letters} | dict(list(classic_curves().items())[:classics])
-    found = {}
+    found: dict[str, Result] = {}
     for name, curve in tracked(curves.items(), "curves"):
         each = rounds + (name not in letters)
         found[name] = stored(folder, name, lambda curve=curve, each=each: search(curve, each))

@@ -21,7 +21,7 @@ import subprocess
 import sys
 import time
 from importlib.util import find_spec
-from typing import Any
+from typing import Any, TypedDict
 
 import jax
 import jax.numpy as jnp
@@ -39,9 +39,19 @@ from udkjax.study.identify.density.laplace import approximate
 TS, NOISE = np.linspace(0.0, 5.0, 500), 0.01
 LINKS = ("body.crank.inertia", "body.coupler.mass", "body.coupler.inertia", "force.damper.damping")
 SCENES = ("plain", "stiff", "friction", "impacts", "sticking")
-MANY = {"chains": 32, "draws": 50, "warmup": 100}  # for scenes in events
-FEW = {"chains": 8, "draws": 250}
-SETS = {"chains": 4, "draws": 100, "warmup": 100}  # of a calibration set
+
+
+class Sampling(TypedDict, total=False):
+    """Numbers of draws: arguments of `udk.sample`."""
+
+    chains: int
+    draws: int
+    warmup: int
+
+
+MANY: Sampling = {"chains": 32, "draws": 50, "warmup": 100}  # for scenes in events
+FEW: Sampling = {"chains": 8, "draws": 250}
+SETS: Sampling = {"chains": 4, "draws": 100, "warmup": 100}  # of a calibration set
 LEVELS = 0.5, 0.95
 # Errors of trusted means, in deviations, and of deviations, as a factor, that are wrong: the largest that are trusted, 0.25 and
 # 1.25, and 1.5 standard errors of the means and deviations of a set's draws, some 200 effective ones.
@@ -80,7 +90,7 @@ def density(kind: str, measured: np.ndarray) -> Any:
     return udk.inference(mech, udk.Record(TS, {"body.crank.angle": measured}, NOISE), names, priors=priors, **settings)
 
 
-def costs(kind: str, measured: np.ndarray, numbers: dict[str, int], peer: bool) -> dict[str, float]:
+def costs(kind: str, measured: np.ndarray, numbers: Sampling, peer: bool) -> dict[str, float]:
     """Return CPU times of a scene in a new process (s), effective samples, and those of numpyro."""
     begun = time.process_time()
     problem = density(kind, measured)
@@ -118,7 +128,7 @@ def by_numpyro(problem: Any, posterior: Any) -> dict[str, float]:
     return {"numpyro": 1000 * spent / min(sizes), "numpyro_error": max(errors)}
 
 
-def in_new_process(kind: str, numbers: dict[str, int], peer: bool) -> dict[str, float]:
+def in_new_process(kind: str, numbers: Sampling, peer: bool) -> dict[str, float]:
     """Return `costs`, computed with empty caches."""
     mech, _, settings = four_bar(kind)
     angle = np.asarray(udk.simulate(mech, TS, **settings).q)[:, 0, 2] + NOISE * np.random.default_rng(0).standard_normal(len(TS))

@@ -11,7 +11,7 @@ import udkjax as udk
 from udkjax.positions.following.drive import drive
 
 
-def random_linkage(seed: int) -> tuple[udk.Mechanism, list[float]]:
+def random_linkage(seed: int) -> tuple[udk.Mechanism, tuple[float, float]]:
     """A four-bar with a plate as coupler, driven through its range, and a dyad on the plate; widths at random."""
     rng = np.random.default_rng(seed)
     while True:
@@ -32,7 +32,7 @@ def random_linkage(seed: int) -> tuple[udk.Mechanism, list[float]]:
         )
         motion = udk.kinematics(mech, "motor", np.linspace(start - 0.4, start + 0.4, 60))
         if np.asarray(motion.reached).all():
-            return mech, [start - 0.4, start + 0.4]
+            return mech, (start - 0.4, start + 0.4)
 
 
 def placed(mech: udk.Mechanism, name: str, q: Any) -> tuple[np.ndarray, float]:

@@ -256,6 +256,7 @@ def test_a_pin_in_a_slot_has_the_answers_of_a_slider():
     assert_allclose(
         [pin.extent, pin.time_ratio, *pin.dead_points], [block.extent, block.time_ratio, *block.dead_points], rtol=1e-9
     )
+    assert pin.speed_ratios is not None and block.speed_ratios is not None
     assert_allclose([x.ratio for x in pin.speed_ratios], [x.ratio for x in block.speed_ratios], rtol=1e-12)
 
 

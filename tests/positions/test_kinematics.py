@@ -550,11 +550,11 @@ def test_what_cannot_be_driven_is_refused():
         udk.kinematics(udk.library.double_pendulum(), f"body.{udk.library.double_pendulum().body_names[0]}.angle", [1.0])
 
 
-def test_the_value_of_a_coordinate_takes_frames():
+@pytest.mark.parametrize(("given", "said"), [((np.zeros(3), np.zeros(3)), "ndarray, ndarray"), ((), "nothing")])
+def test_the_value_of_a_coordinate_takes_frames(given, said):
     crank = udk.Coordinate(["ground", "crank"], "angle")
-    for given, said in ((np.zeros(3), np.zeros(3)), "ndarray, ndarray"), ((), "nothing"):
-        with pytest.raises(TypeError, match=f'a udk.Frame of each of "ground", "crank", not {said}'):
-            crank.value(*given)
+    with pytest.raises(TypeError, match=f'a udk.Frame of each of "ground", "crank", not {said}'):
+        crank.value(*given)
 
 
 ASK = {

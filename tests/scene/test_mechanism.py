@@ -307,7 +307,7 @@ def test_methods_are_trees_of_the_numbers_of_their_mechanism():
         assert [id(x) for x in jax.tree.leaves(method)] == [id(x) for x in jax.tree.leaves(mechanism)]
         assert method.__name__ and method.__doc__ == getattr(type(mechanism), method.__name__).__doc__
         assert pickle.loads(pickle.dumps(method)).__name__ == method.__name__
-    traced = jax.jit(lambda method: method()["body.rod.mass"])
+    traced: Any = jax.jit(lambda method: method()["body.rod.mass"])  # JAX does not document _cache_size
     for mass in (1.0, 2.0):
         assert_allclose(traced(mechanism.with_parameters({"body.rod.mass": mass}).parameters), mass)
     assert traced._cache_size() == 1
@@ -330,4 +330,4 @@ def test_methods_of_users_elements_may_be_replaced_and_abstract():
     assert_allclose(Twice(["b"]).loads(0.3, None)[0][0], 2.0 * np.sin(0.3))
     assert jax.tree.leaves(Twice(["b"]).size) == []
     with pytest.raises(TypeError, match="abstract"):
-        udk.Motion()
+        udk.Motion()  # pyright: ignore[reportAbstractUsage]

@@ -254,6 +254,7 @@ def test_links_that_touch_are_red_and_a_click_shows_where_they_are_closest(studi
     assert found.least.distance < 0 and studio.js(painted) == 2
     studio.js("studio.files.export('touching.svg', null)")
     assert 'class="touching"' in (studio.folder / "touching.svg").read_text()
+    assert found.count is not None
     away = found.least.value + np.pi  # half a turn later, links are apart
     studio.js(f"studio.motion.goTo('{np.degrees(away + found.count.offset):.6f} deg')")
     studio.page.wait_for_timeout(100)

@@ -294,7 +294,9 @@ def _texts(svg: str) -> list[tuple[str, float, float, float]]:
 def test_texts_of_figures_cover_neither_each_other_nor_leave_the_figure(solutions, name, tmp_path):
     solutions[name].save(tmp_path / "page.html")
     for svg in re.findall("<svg.*?</svg>", (tmp_path / "page.html").read_text(), re.DOTALL):
-        width, height = (float(x) for x in re.search(r'viewBox="0 0 ([\d.]+) ([\d.]+)"', svg).groups())
+        view = re.search(r'viewBox="0 0 ([\d.]+) ([\d.]+)"', svg)
+        assert view is not None
+        width, height = map(float, view.groups())
         texts = _texts(svg)
         for k, (words, x, y, wide) in enumerate(texts):
             assert wide / 2 - 1 < x < width - wide / 2 + 1 and 6 < y < height - 6, words

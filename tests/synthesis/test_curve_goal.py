@@ -28,8 +28,8 @@ BOUNDS = {f"pin.{name}": (-25.0, 25.0) for name in "OABPC"}
 
 def random_curves(rng, K, N, is_whole):
     t = np.linspace(0.0, 2 * np.pi if is_whole else 5.0, N, endpoint=not is_whole)
-    size = rng.normal(size=(6, K, 1)) + 1j * rng.normal(size=(6, K, 1))
-    return sum(a * np.exp(1j * k * t) / (1 + k * k) for a, k in zip(size, (-2, -1, 0, 1, 2, 3), strict=True))
+    size, k = rng.normal(size=(6, K, 1)) + 1j * rng.normal(size=(6, K, 1)), np.arange(-2, 4)[:, None, None]
+    return (size * np.exp(1j * k * t) / (1 + k * k)).sum(0)
 
 
 @pytest.mark.parametrize("curve", [BEAN, CORNER])
@@ -92,7 +92,10 @@ def test_a_file_gives_a_curve_in_its_unit(tmp_path):
     (tmp_path / "curve.csv").write_text("x, y\n0, 6000\n0, 0\n4000, 0\n", encoding="utf-8")
     text = 'mechanism = "bar.toml"\nunits.length = "mm"\n[goal]\nkind = "curve"\npin = "P"\npoints = "curve.csv"\nsamples = 12\n'
     (tmp_path / "goal.toml").write_text(text, encoding="utf-8")
-    goal = read_design(tmp_path / "goal.toml").problem.goal
+    search = read_design(tmp_path / "goal.toml")
+    assert isinstance(search, udk.DesignSearch)
+    goal = search.problem.goal
+    assert isinstance(goal, udk.CurveGoal)
     np.testing.assert_allclose(goal.points, CORNER)
     assert not goal.is_whole and goal.extras == 1
     (tmp_path / "goal.toml").write_text(text.replace("curve.csv", "bar.toml"), encoding="utf-8")

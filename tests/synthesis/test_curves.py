@@ -167,7 +167,8 @@ def test_linkages_that_end_at_a_limit_are_kept():
     wanted = WantedCurve([[0, 6], [0, 0], [4, 0]])
     search = CurveSearch(wanted, LinkageLimits(np.cos(np.deg2rad(25.0)), 3.0, 0.1), 6, seed=0)
     stages = search.stages()
-    next(stages), next(stages)
+    for _ in range(2):
+        next(stages)
     best = search.fresh[6]
     assert len(best.x) >= 4
     at = positions(best.x, best.topology, turn_angles(len(best.x)), 0.0)
@@ -229,11 +230,11 @@ def test_a_search_ends_in_the_middle_of_a_stage_and_keeps_what_it_has():
 
 def test_the_curve_of_a_slider_crank_is_drawn_with_a_slide(tmp_path):
     A = np.exp(1j * np.linspace(0.0, 2.0 * np.pi, 120))
-    slider = A.real + np.sqrt(9.0 - (A.imag - 0.3) ** 2) + 0.3j
+    slider = np.real(A) + np.sqrt(9.0 - (np.imag(A) - 0.3) ** 2) + 0.3j
     curve = as_points(A + (slider - A) * (0.5 + 0.3j))
     found = udk.mechanisms_for(curve, bars=4, slides=True, geared=False, seconds=600, rounds=1, results=9, progress=False)
     best = min(found, key=lambda one: one.error)
-    assert best.error < 0.002 and best.bars == 4 and best.drawing.groups["slide"]
+    assert best.error < 0.002 and best.bars == 4 and best.drawing is not None and best.drawing.groups["slide"]
     udk.save(best.mechanism, tmp_path / "slider.toml")
     mechanism = udk.load(tmp_path / "slider.toml")
     motion = udk.kinematics(mechanism, None, np.linspace(0.0, 1.0, 721))

@@ -8,6 +8,7 @@ from udkjax.positions import gap_in_position
 from udkjax.scene.drawing.drawn_quantities import Units
 from udkjax.synthesis import goal_file
 from udkjax.synthesis.ranges.second_order import quadratic
+from udkjax.synthesis.robust_goal import RobustTerm
 
 LINKS = {"crank": ("OA", 10), "coupler": ("ABP", None), "rocker": ("CB", 10)}
 DRAWING = udk.Drawing(
@@ -45,6 +46,7 @@ def test_the_measure_is_that_of_pieces_moved_one_by_one_and_its_derivatives_are_
         robust_goal = udk.RobustGoal(udk.GapGoal("crank", "rocker", least=0.05, samples=4), TOLERANCES, 2.0)
     rotation = None if goal == "gap" else False
     (term,) = (search := udk.DesignSearch(DRAWING, [PATH, robust_goal], ["pin.A", "pin.B"], rotation=rotation)).problem.terms
+    assert isinstance(term, RobustTerm)
     x, mechanism = search.problem.free.vector[None], DRAWING.mechanism()
     found, slopes, there = term.measures(x)
     assert there.all()
@@ -63,7 +65,9 @@ def test_the_measure_is_that_of_pieces_moved_one_by_one_and_its_derivatives_are_
 
     wanted = np.sqrt(robust(measured, 2.0)) if goal == "path" else robust(measured, -2.0)
     np.testing.assert_allclose(found[0], wanted, rtol=1e-9)
-    np.testing.assert_allclose(term.measure_motion(mechanism, x[0], 0.0), found[0], rtol=1e-9)
+    followed = term.measure_motion(mechanism, x[0], 0.0)
+    assert followed is not None
+    np.testing.assert_allclose(followed, found[0], rtol=1e-9)
     for k in range(x.shape[1]):
         step = 1e-6 * np.eye(x.shape[1])[k]
         difference = (term.measures(x + step)[0] - term.measures(x - step)[0]) / 2e-6
@@ -103,10 +107,11 @@ def test_robust_goals_of_files_have_units():
         return goal_file._read_motion("motion[0]", mechanism, PATH, given, Units({"length": "mm"}), problems)
 
     found = read(kind="robust", tolerances={"length(crank)": 0.3, "length(rocker)": "h9"}, sigmas=4, most=0.5)
-    assert found is not None and found.goal is PATH
+    assert isinstance(found, udk.RobustGoal) and found.goal is PATH
     assert (found.most, found.sigmas, found.tolerances) == (5e-4, 4.0, {"length(crank)": 3e-4, "length(rocker)": "h9"})
     torque = read(kind="robust", tolerances={"length(crank)": 0.3}, goal={"kind": "torque", "most": "2 N mm", "speed": "1 rad/s"})
-    assert torque is not None and torque.goal.most == torque.most == pytest.approx(2e-3)
+    assert isinstance(torque, udk.RobustGoal) and isinstance(torque.goal, udk.TorqueGoal)
+    assert torque.goal.most == torque.most == pytest.approx(2e-3)
     assert problems == []
     assert read(kind="robust", most=0.5, tolerance={}) is None
     assert "motion[0].tolerance" in problems[0] and "motion[0].tolerances: missing" in problems[1]

@@ -371,7 +371,7 @@ def test_what_cannot_be_exported_is_refused(tmp_path, capsys):
 @pytest.mark.parametrize("name", [*sorted(udk.library.__all__), *DRAWINGS], ids=lambda x: Path(x).stem)
 def test_every_scene_runs_in_an_importer(name, tmp_path):
     fmpy = pytest.importorskip("fmpy")
-    from fmpy.validation import validate_fmu
+    from fmpy.validation import validate_fmu  # pyright: ignore[reportMissingImports]
 
     mechanism, file = scene(name), str(tmp_path / "a.fmu")
     end = 0.03 if name == "andrews_squeezer" else 2.0

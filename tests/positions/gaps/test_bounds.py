@@ -32,8 +32,8 @@ def corners(count, number, rng):
 def test_bounds_by_features_hold_and_are_of_the_fourth_order(counts):
     rng, number = np.random.default_rng(sum(counts)), 300
     bodies = np.array([rng.permutation(4)[:2] for _ in range(number)]).T
-    shapes, radii = [corners(count, number, rng) for count in counts], np.full((2, number), 0.01)
-    pairs = PartPairs(np.arange(number), np.zeros((2, number), int), bodies, *shapes, radii)
+    A, B = (corners(count, number, rng) for count in counts)
+    pairs = PartPairs(np.arange(number), np.zeros((2, number), int), bodies, A, B, np.full((2, number), 0.01))
     search = PairSearch(pairs, MotionTables(random_motion(rng)))
     k, excess = np.arange(number), []
     for share in (1.0, 0.25):
@@ -81,7 +81,7 @@ def test_roots_of_smooth_functions_and_of_kinks():
         y = x - roots[i]
         return np.where(i < 20, np.sinh(3 * y), np.where(i < 40, y**3 + 1e-3 * y, np.where(y < 0, -1.0, 5.0)))
 
-    every, ends = np.arange(60), (np.full(60, -1.5), np.full(60, 1.2))
+    every, start, end = np.arange(60), np.full(60, -1.5), np.full(60, 1.2)
     guess = roots + rng.normal(size=60) * 1e-3
-    found = _roots(f, *ends, *(f(x, every) for x in ends), guess)
+    found = _roots(f, start, end, f(start, every), f(end, every), guess)
     assert np.abs(found - roots).max() < 1e-11

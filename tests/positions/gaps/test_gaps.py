@@ -76,9 +76,9 @@ def test_signed_distances_are_maxima_over_directions(counts):
     found = closest(A, B).features(counts, k)
     for of_a, one, other in ((True, A, B), (False, B, A)):
         some = k[found.of_a == of_a]
-        f, places = found.take(some), (one, other, other)
-        points = (x[c, :, some].T for x, c in zip(places, found.take(some)[1:4], strict=True))
-        distance, n, _ = gap_at(*points, f.side, f.at)
+        f = found.take(some)
+        p, start, end = (x[c, :, some].T for x, c in zip((one, other, other), f[1:4], strict=True))
+        distance, n, _ = gap_at(p, start, end, f.side, f.at)
         assert np.allclose(distance, got[some], atol=1e-14) and np.allclose(np.hypot(*n), 1.0)
 
 

@@ -141,7 +141,9 @@ def test_links_that_touch_are_red_in_pictures_and_films(wide, tmp_path):
 
     shapes = Sketch([], marked.pose(0.0)[0], view, touching=[*areas, *discs]).shapes
     assert [type(shape) for shape in shapes] == [Line, Line, Circle, Circle]
-    assert shapes[0].closed and shapes[0].fill and shapes[2].radius == pytest.approx(view.scale * 0.03)
+    area, disc = shapes[0], shapes[2]
+    assert isinstance(area, Line) and area.closed and area.fill
+    assert isinstance(disc, Circle) and disc.radius == pytest.approx(view.scale * 0.03)
 
 
 def test_the_button_leads_to_the_least_gap_and_links_that_touch_are_red(opened, wide):

@@ -149,11 +149,11 @@ def test_by_draws_the_score_is_the_mean_over_them(posterior, candidates):
     scores, variances = np.zeros((2, 32)), np.zeros((2, 32, 2))
     for j, k in enumerate(some):
         for c, angle in enumerate(ANGLES[1:]):
-            slope = [
-                (prediction(*(x[k] * (1 + h * e)), angle, 0.0) - prediction(*(x[k] * (1 - h * e)), angle, 0.0)) / (2 * h * NOISE)
-                for e in np.eye(2)
-            ]
-            M = prior + np.array(slope) @ np.array(slope).T
+            more, less = (
+                [prediction(*(x[k] * (1 + step * e)), angle=angle, amplitude=0.0) for e in np.eye(2)] for step in (h, -h)
+            )
+            slope = np.subtract(more, less) / (2 * h * NOISE)
+            M = prior + slope @ slope.T
             scores[c, j], variances[c, j] = np.linalg.slogdet(M)[1], np.diag(np.linalg.inv(M)) * x[k] ** 2
     np.testing.assert_allclose(found.scores, scores.mean(1), rtol=1e-4)
     np.testing.assert_allclose(found.standard_errors, np.sqrt(variances.mean(1)), rtol=1e-3)

@@ -241,14 +241,21 @@ def test_numbers_are_read_and_printed_in_the_units_of_the_drawing(four_bar, tmp_
     pins = {"A": [0, 0], "B": [500, 866.0254037844386], "C": [2700.0, 1900.0], "D": [2500, 0]}
     links = {name: {"pins": list(ends), "mass": 1} for name, ends in (("crank", "AB"), ("coupler", "BC"), ("rocker", "CD"))}
     mech = udk.Drawing(pins=pins, links=links, ground=["A", "D"], units={"length": "mm", "angle": "deg"}).mechanism()
-    measures, drive = [SWING, "deviation(pin.C)"], {"drive": "body.crank.angle", "values": [0.0, 0.1, 0.2]}
+    measures = [SWING, "deviation(pin.C)"]
     given = {"length(crank)": ("2", 2e-3), "length(rocker)": ("+-3", 3e-3)}
     limits = {SWING: ("40", np.radians(40)), measures[1]: ("1.5", 1.5e-3)}
     texts, numbers = (
-        udk.tolerances(mech, *({k: x[n] for k, x in part.items()} for part in (given,)), measures, samples=2000,
-                       limits={k: x[n] for k, x in limits.items()}, **drive)
+        udk.tolerances(
+            mech,
+            {k: x[n] for k, x in given.items()},
+            measures,
+            drive="body.crank.angle",
+            values=[0.0, 0.1, 0.2],
+            limits={k: x[n] for k, x in limits.items()},
+            samples=2000,
+        )
         for n in (0, 1)
-    )  # fmt: skip
+    )
     assert np.array_equal(texts.measured, numbers.measured) and texts.yield_ == numbers.yield_
     swing, place = (line.split() for line in str(texts).splitlines()[2:4])
     assert swing[:3] == [SWING, "deg", f"{np.degrees(texts.nominal[0]):.6g}"]
