@@ -148,7 +148,17 @@ def in_order(a, b):
     )  # fmt: skip
 
 
+def masks(a, b):
+    x, y = a > 0, b > 0
+    return (
+        x < y, x <= y, x > y, x >= y, x == y, x != y, jnp.maximum(x, y), jnp.minimum(x, y), jnp.where(x < y, a, b),
+        x.max(0), x.min(1), x.argmax(1), x.argmin(0), x.sum(1), x.cumsum(0), x.astype(float), x.astype(int),
+        jnp.sort(x, 0), jnp.argsort(~x, 1, stable=True), jnp.all(x, 0), jnp.any(y, 1), jnp.argmax(jnp.any(x & y, 0)),
+    )  # fmt: skip
+
+
 CASES = {
+    "masks": (masks, (A, B)),
     "arithmetic": (
         lambda a, b: (a + b, a - b, a * b, a / b, -a, jnp.abs(a), a**3, a**2, jnp.square(a), a % b, lax.sign(a)),
         (A, B),

@@ -169,6 +169,8 @@ class Function:
     def compare(self, kind: str, a: Operand, b: Operand) -> Value:
         x, y = self.both(a, b)
         of_doubles, of_integers = _COMPARE[kind]
+        if x.base == BOOL:  # one bit: as a signed number, true would be -1
+            of_integers = of_integers.replace("s", "u")
         name = f"fcmp {of_doubles}" if x.base == DOUBLE else f"icmp {of_integers}"
         return self.op(f"{name} {x.type} {x.name}, {y.name}", BOOL, x.width)
 

@@ -230,6 +230,8 @@ def apply(f: Function, name: str, parameters: Mapping[str, Any], a: list[Value],
         case "clamp" if a[0].base == INT:
             low = f.select(f.compare("lt", a[1], a[0]), a[0], a[1])
             return f.select(f.compare("gt", low, a[2]), a[2], low)
+        case "max" | "min" if a[0].base == BOOL:
+            return f.logic("or" if name == "max" else "and", *a)
         case "max" | "min" if a[0].base == INT:
             return f.select(f.compare("gt" if name == "max" else "lt", a[0], a[1]), a[0], a[1])
         case "shift_right_arithmetic" | "shift_right_logical" | "shift_left" if a[0].base == INT:

@@ -80,12 +80,14 @@ def extreme(name: str, to: Lowering, inputs: list[Array], p: dict[str, Any], out
     f, sign = to.f, -1 if name == "max" else 1
 
     def join(a: Value, b: Value) -> Value:
+        if a.base == BOOL:
+            return a | b if name == "max" else a & b
         if a.base == INT:
             return f.select(f.compare("gt" if name == "max" else "lt", a, b), a, b)
         return f.intrinsic(f"{name}imum", a, b)
 
     whole = np.iinfo(out.dtype) if out.dtype.kind == "i" else None
-    start = {DOUBLE: sign * np.inf, INT: 0 if whole is None else int(whole.min if sign < 0 else whole.max)}
+    start = {BOOL: name == "min", DOUBLE: sign * np.inf, INT: 0 if whole is None else int(whole.min if sign < 0 else whole.max)}
     return reduce_axes(start, join, to, inputs, p, out)
 
 

@@ -156,7 +156,8 @@ def stack(to: Lowering, inputs: list[Array], p: dict[str, Any], out: Any) -> Arr
 def unstack(to: Lowering, equation: Any, inputs: list[Array]) -> list[Array]:
     """Return the parts of an array along an axis."""
     x = to.stored(inputs[0])
-    axis, shape = equation.params["axis"] % len(x.shape), equation.outvars[0].aval.shape
+    axis = equation.params["axis"] % len(x.shape)
+    shape = (*x.shape[:axis], *x.shape[axis + 1 :])
 
     def part(k: int) -> Array:
         return _view(x, shape, lambda index: (*index[:axis], k, *index[axis:]), to.f)
