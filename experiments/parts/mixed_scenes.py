@@ -307,7 +307,8 @@ class _Draw:
         self.events.append({"name": name, "type": "contact", **place, **friction})
 
     def _rubbing_contact(self) -> None:
-        self._contact("rubbing contact", coefficient=float(self.of.uniform(0.1, 0.5)))
+        # from one that hardly rubs to one that stops what it hits at once
+        self._contact("rubbing contact", coefficient=float(10 ** self.of.uniform(-1.3, 0.5)))
 
     def _limit(self) -> None:
         if joints := self.linkage.pins + self.linkage.slides:
