@@ -13,6 +13,7 @@ import udkjax as udk
 from experiments.parts.atlas_own import BraunGoldfarb
 from tests.integrate.systems.own_systems import G, pendulum
 from tests.integrate.systems.test_own_methods import BenIsrael
+from udkjax.native.lowering.lowering import APART
 from udkjax.native.lowering.module_calls import ModuleCall, call_p, simplified
 
 RATE = np.sqrt(G / 0.6)  # of the conical pendulum 0.6 m below its pivot
@@ -45,6 +46,19 @@ class Newton(udk.Stabilization):
 
     def end_of_step(self, at):
         def step(_, at):
+            return at.moved(at.q - at.change_of_positions(at.psi), at.v)
+
+        at = jax.lax.fori_loop(0, 3, step, at)
+        return at.q, at.v - at.change_of_velocities(at.psi_dot)
+
+
+class LongNewton(udk.Stabilization):
+    """The same, in a loop whose body is so long that it becomes a function, which calls the equations."""
+
+    def end_of_step(self, at):
+        def step(_, at):
+            for _ in range(APART):
+                at = at.moved(at.q * 1.0, at.v)
             return at.moved(at.q - at.change_of_positions(at.psi), at.v)
 
         at = jax.lax.fori_loop(0, 3, step, at)
@@ -129,6 +143,12 @@ def test_projection_by_hand():
     own = run("redundant", Newton(), engine="native")
     assert_allclose(own.q, run("redundant", udk.Projection()).q, atol=1e-7)
     assert np.abs(udk.violation(udk.library.parallelogram(), own))[-1].max() < 1e-12
+
+
+def test_a_long_loop_that_calls_the_equations():
+    first, second = (udk.simulate(udk.library.four_bar(), TS, stabilization=x()) for x in (Newton, LongNewton))
+    assert first.settings["engine"] == second.settings["engine"] == "native"
+    assert_allclose(second.q, first.q, rtol=0, atol=1e-14)
 
 
 def test_lanes():

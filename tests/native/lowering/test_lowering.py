@@ -17,7 +17,7 @@ from udkjax.native.code import machine, processor
 from udkjax.native.language.program import UnsupportedError
 from udkjax.native.language.text import text_of_module
 from udkjax.native.lowering.arrays import Stored, base_of
-from udkjax.native.lowering.lowering import LoweredFunction, Lowering, traced
+from udkjax.native.lowering.lowering import APART, LoweredFunction, Lowering, traced
 from udkjax.native.lowering.module_calls import call_p
 from udkjax.native.lowering.own_objects import Written
 from udkjax.native.lowering.rules import CONTROL, ELEMENTWISE, RULES, lower
@@ -157,7 +157,21 @@ def masks(a, b):
     )  # fmt: skip
 
 
+def long(a, b):
+    """More operations than a function has in machine code: it is split."""
+    for _ in range(APART):
+        a = 0.9 * a + b
+    return a, jnp.any(a > b)
+
+
+def long_parts(a, b):
+    of_branch = lax.cond(jnp.sum(a) > 0, long, lambda a, b: (b, jnp.sum(a) > 1), a, b)
+    of_loop = lax.fori_loop(0, 3, lambda k, x: long(x, b)[0] * k, a)
+    return *of_branch, of_loop, *jax.jit(long)(a, b), *jax.jit(long)(b, a)
+
+
 CASES = {
+    "long parts": (long_parts, (A, B)),
     "masks": (masks, (A, B)),
     "arithmetic": (
         lambda a, b: (a + b, a - b, a * b, a / b, -a, jnp.abs(a), a**3, a**2, jnp.square(a), a % b, lax.sign(a)),
@@ -317,6 +331,12 @@ def test_memory_that_is_too_small_is_refused():
     assert Written(f, size).within(size) is f
     with pytest.raises(RuntimeError, match=f"takes memory for {size} numbers, not {size - 1}"):
         Written(f, size).within(size - 1)
+
+
+def test_equal_parts_are_one_function():
+    """The branch and both calls have one, the body of the loop another."""
+    f, *_ = write(long_parts, (A, B), 1)
+    assert len([name for name in f.evaluated if name.startswith("part_")]) == 2
 
 
 def test_webassembly():

@@ -271,6 +271,11 @@ class Function:
         index, stored = self.like(k, INT, 1), INT if base == POINTER else base
         return self.op(f"getelementptr {stored}, ptr {name}, i64 {index.name}", POINTER)
 
+    def distance(self, pointer: Value, other: Value) -> Value:
+        """Return the index of the number at another pointer, relative to a pointer."""
+        first, last = (self.op(f"ptrtoint ptr {x.name} to i64", INT) for x in (pointer, other))
+        return self.op(f"ashr exact i64 {(last - first).name}, 3", INT)
+
     def load(self, pointer: Value | str, k: Operand = 0, width: int = 1, base: str = DOUBLE) -> Value:
         place = self.at(pointer, k, base)
         return self.op(f"load {llvm_type(base, width)}, ptr {place.name}, align 8", base, width)

@@ -93,6 +93,10 @@ class Stored(Array):
         self.strides = contiguous if strides is None else tuple(strides)
         self.is_contiguous = self.strides == contiguous
 
+    def at(self, pointer: Value) -> "Stored":
+        """Return the same array for another pointer to it."""
+        return Stored(pointer, self.shape, self.base, self.varies, self.start, self.strides)
+
     def _place(self, index: Index) -> Operand:
         place: Any = self.start
         for i, stride in zip(index, self.strides, strict=True):

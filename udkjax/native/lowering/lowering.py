@@ -4,6 +4,7 @@ Loops that run equally long in all lanes are loops; in others a lane that has en
 differently, each result is selected; a branch that no lane takes is not run.
 """
 
+import hashlib
 from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -14,8 +15,12 @@ from jax.extend import core
 
 from udkjax.native.language.ir import BOOL, DOUBLE, INT, POINTER, Function, Value, Variable
 from udkjax.native.lowering.arrays import Array, Constant, Index, Lazy, SingleNumber, Stored, base_of, fit
-from udkjax.native.lowering.varying import states_of_while, varying, varying_states, without_constants
+from udkjax.native.lowering.varying import parts_of, places_of_calls, states_of_while, varying, varying_states, without_constants
 
+# Operations of a branch, of the body of a loop or of a call that becomes a function of its own: equal ones are one function,
+# and LLVM takes more than in proportion to the length of a function. The instants of a box on two corners with friction take
+# 13 s in one function, 2.9 s in functions of more than 60 operations, 3.3 s in those of more than 200.
+APART = 60
 UNROLLED = 16  # loops over at most this many elements are unrolled
 LONGEST = 40  # an array whose elements take more operations is stored, so that the text of one loop stays short
 
@@ -169,7 +174,7 @@ class Lowering:
         found = [self.new((length, *v.shape), base_of(v.dtype), flag) for v, flag in zip(avals, everywhere, strict=True)]
         with f.each(length) as k:
             i = (length - 1) - k if reverse else k
-            outs = self.closed(body, [*constants, *(s.value() for s in states), *(row_of(f, x, i) for x in rows)])
+            outs = self.part(body, [*constants, *(s.value() for s in states), *(row_of(f, x, i) for x in rows)])
             for to, x in zip(found, outs[len(states) :], strict=True):
                 self.each(x.shape, lambda index, to=to, x=x: to.write(f, (i, *index), x.read(f, index)))
             self.move(states, outs[: len(states)])
@@ -192,7 +197,7 @@ class Lowering:
             return f.any_of(active[0])
 
         with f.while_(goes_on):
-            outs = self.closed(body, [*of_body, *(s.value() for s in states)])
+            outs = self.part(body, [*of_body, *(s.value() for s in states)])
             self.move(states, outs, active[0] if parts else None)
         return [s.value() for s in states]
 
@@ -214,8 +219,45 @@ class Lowering:
             else:
                 chosen = index <= 0 if k == 0 else index >= k if k == last else index.is_(k)
             with f.if_(f.any_of(chosen)):
-                self.move(states, self.closed(branch, operands), chosen if which.varies else None)
+                self.move(states, self.part(branch, operands), chosen if which.varies else None)
         return [s.value() for s in states]
+
+    def part(self, closed: Any, given: Sequence[Array]) -> list[Array]:
+        """Lower a jaxpr with its constants, a long one as a function of its own."""
+        return self._apart(closed, given) if operations(closed) > APART else self.closed(closed, given)
+
+    def _apart(self, closed: Any, given: Sequence[Array]) -> list[Array]:
+        """Lower a jaxpr as a function of its own, and call it; equal texts are one function."""
+        f, in_module = self.f, "work" in self.f.given
+        known = [x if isinstance(x, Constant) else self._in_memory(x) for x in given]
+        memory = {f"in{k}": x for k, x in enumerate(known) if isinstance(x, Stored)}
+        flags, places = varying(closed, [x.varies for x in known]), sorted(places_of_calls(closed)) if in_module else []
+        avals = [v.aval for v in without_constants(closed).outvars]
+        outs = [self.new(v.shape, base_of(v.dtype), flag) for v, flag in zip(avals, flags, strict=True)]
+        pointers = [*memory, *places, *(f"out{k}" for k in range(len(outs))), "scratch"]
+        own = LoweredFunction("part", pointers, f.width, in_module)
+        to = Lowering(own, own.given["scratch"], self._lower)
+        inner = [to.constant(x.numbers) if isinstance(x, Constant) else x.at(own.given[f"in{k}"]) for k, x in enumerate(known)]
+        for k, x in enumerate(to.closed(closed, inner)):
+            to.fill(outs[k].at(own.given[f"out{k}"]), x)
+        own.name = f"part_{hashlib.sha256(own.text().encode()).hexdigest()[:16]}"
+        scratch = self.new((to.size,), DOUBLE, True)
+        addresses = [*(x.pointer for x in memory.values()), *(f.given[x] for x in places), *(x.pointer for x in (*outs, scratch))]
+        if in_module:
+            work = f.given["work"]
+            own.call_in(f, work, *(f.distance(work, x) for x in addresses))
+        else:
+            own.call_in(f, *addresses)
+        return list(outs)
+
+    def _in_memory(self, x: Array) -> Stored:
+        """Return an array that has a place in memory."""
+        x = self.stored(x)
+        if isinstance(x, Stored):
+            return x
+        to = self.new(x.shape, x.base, x.varies)
+        self.fill(to, x)
+        return to
 
     def move(self, states: Sequence["LoopState"], nodes: Sequence[Array], mask: Value | None = None):
         """Assign new values to all states together, in the lanes of a mask."""
@@ -226,6 +268,11 @@ class Lowering:
             known.append(self.copied(x) if is_state else self.stored(x))
         for s, x in zip(states, known, strict=True):
             s.assign(x, mask)
+
+
+def operations(jaxpr: Any) -> int:
+    """Return the number of operations of a jaxpr, with those within its loops and branches."""
+    return sum(1 + sum(map(operations, parts_of(e))) for e in without_constants(jaxpr).eqns)
 
 
 class LoopState:

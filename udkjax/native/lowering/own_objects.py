@@ -14,6 +14,7 @@ import numpy as np
 from udkjax.native.code import code_cache
 from udkjax.native.language.ir import DOUBLE
 from udkjax.native.language.program import UnsupportedError
+from udkjax.native.language.text import with_evaluated
 from udkjax.native.lowering.arrays import Stored
 from udkjax.native.lowering.lowering import LoweredFunction, Lowering, traced
 from udkjax.native.lowering.module_calls import simplified
@@ -119,7 +120,7 @@ class Written(NamedTuple):
 
     def calls(self, name: str) -> bool:
         """Return whether the function calls a function of the module."""
-        return any(f"@{name}(" in line for line in self.function.parts[0])
+        return any(f"@{name}(" in f.text() for f in with_evaluated([self.function]))
 
     def within(self, size: int) -> LoweredFunction:
         """Return the function if `size` numbers of scratch memory in each lane are enough for it.

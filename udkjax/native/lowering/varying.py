@@ -20,6 +20,23 @@ def inlined(equation: Any) -> Any:
     return next(equation.params[k] for k in ("jaxpr", "call_jaxpr", "fun_jaxpr") if k in equation.params)
 
 
+def parts_of(equation: Any) -> list[Any]:
+    """Return the jaxprs within an equation: of calls, loops and branches."""
+    found = (x for p in equation.params.values() for x in (p if isinstance(p, tuple | list) else (p,)))
+    return [x for x in found if hasattr(without_constants(x), "eqns")]
+
+
+def places_of_calls(jaxpr: Any) -> set[str]:
+    """Return the names of the places of all arguments and results of calls of a module's functions."""
+    found: set[str] = set()
+    for e in without_constants(jaxpr).eqns:
+        if (call := e.params.get("call")) is not None and hasattr(call, "functions"):
+            found |= {*call.arguments, *(name for name, _ in call.results)}
+        for part in parts_of(e):
+            found |= places_of_calls(part)
+    return found
+
+
 def counts_of_scan(equation: Any) -> tuple[int, int]:
     """Return the numbers of constants and of states of a scan, by shapes: its parameters have other names in each release."""
     inner = without_constants(equation.params["jaxpr"])
