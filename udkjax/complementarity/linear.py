@@ -6,6 +6,8 @@ the rows of this set independent. x is then the solution of linear equations, an
 NumPy, with any leading dimensions.
 """
 
+from collections.abc import Callable
+from functools import partial, wraps
 from types import ModuleType
 from typing import Any, NamedTuple
 
@@ -25,6 +27,22 @@ ON_RAY = 1e-9
 STEPS_PER_ROW = 6  # one step per positive x is usual; the limit stops cycles caused by rounding
 
 
+def traced_once(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a function of arrays and then their module, which JAX traces once for each shape.
+
+    Programs call it wherever they need it, and its machine code is a single function.
+    """
+    traced = jax.jit(partial(function, xp=jnp))
+
+    @wraps(function)
+    def call(*arrays: Any, xp: ModuleType = jnp) -> Any:
+        if arrays and isinstance(arrays[-1], ModuleType):
+            arrays, xp = arrays[:-1], arrays[-1]
+        return traced(*arrays) if xp is not np else function(*arrays, xp=xp)
+
+    return call
+
+
 class Complementary(NamedTuple):
     """The solution of a linear complementarity problem."""
 
@@ -41,13 +59,14 @@ class _Pivoting(NamedTuple):
     done: Any
 
 
+@traced_once
 def solve_complementarity(
     W: Float[Any, "*m E E"],
     b: Float[Any, "*m E"],
     allowed: Bool[Any, "*m E"],
     floor: Float[Any, "*m E"],
-    xp: ModuleType = jnp,
     equalities: Bool[Any, "*m E"] | None = None,
+    xp: ModuleType = jnp,
 ) -> Complementary:
     """Solve 0 <= x, W x + b >= 0, x (W x + b) = 0 by principal pivoting.
 
@@ -56,8 +75,8 @@ def solve_complementarity(
         b: y for x = 0.
         allowed: mask of the x that may be positive; all others are zero, whatever y is.
         floor: tolerance on y >= 0.
-        xp: jax.numpy, or NumPy.
         equalities: mask of independent rows with y = 0, whose x have either sign; None: there are none.
+        xp: jax.numpy, or NumPy.
 
     Returns:
         x and y, with derivatives for the final passive set.
@@ -153,6 +172,7 @@ def _lemke(M: Float[Any, "n n"], q: Float[Any, "n"], xp: ModuleType) -> tuple[Bo
     return passive & solved, solved
 
 
+@traced_once
 def eliminate(
     W: Float[Any, "*m E E"], rows: Bool[Any, "*m E"], least: Float[Any, "*m E"], xp: ModuleType = jnp
 ) -> tuple[Float[Any, "*m E E"], Bool[Any, "*m E"]]:

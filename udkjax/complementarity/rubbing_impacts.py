@@ -28,6 +28,8 @@ is one problem, of the speeds at its end (Stewart and Trinkle 1996), with a solu
 The work of all impulses is never positive: the expansion ends where it would have returned the work of the compression.
 """
 
+import math
+from functools import partial
 from types import ModuleType
 from typing import Any, NamedTuple
 
@@ -105,6 +107,10 @@ def rubbing_impact(contacts: RubbingContacts, of_rows: Int[np.ndarray, "F"], xp:
         return _impact(RubbingContacts(*contact), of_rows, xp)
 
     if xp is not np:
+        lead = contacts.y.shape[:-1]
+        if lead and math.prod(lead) == 1:  # the single member of a run: as a batch it would go on after its end
+            alone = (x.reshape(x.shape[x.ndim - k :]) for x, k in zip(contacts, (2, 1, 1, 1, 1), strict=True))
+            return one(*alone).reshape(contacts.y.shape)
         return jnp.vectorize(one, signature="(r,r),(r),(n),(f),(n)->(r)")(*contacts)
     members = [
         np.broadcast_to(x, (*contacts.y.shape[:-1], *x.shape[x.ndim - k :]))
@@ -124,7 +130,8 @@ def _impact(contacts: RubbingContacts, of_rows: Any, xp: ModuleType) -> Any:
     state = _Progress(none, y, none[N:], approach, none[:N], one, 0 * one, xp.asarray(0), no, no, no)
     state, most = _at_rest(law, state), 2 * (_most_parts(law) + 2)
     if xp is not np:
-        return jax.lax.scan(lambda state, _: (_advance(law, state), None), state, length=most)[0].x
+        step = lambda state, _: (jax.lax.cond(state.done, lambda s: s, partial(_advance, law), state), None)  # noqa: E731
+        return jax.lax.scan(step, state, length=most)[0].x
     while not state.done:
         state = _advance(law, state)
     return state.x
@@ -181,7 +188,7 @@ def _advance(law: _ImpactLaw, state: _Progress) -> _Progress:
     if xp is np:
         return moved if goes else fails
     choose = lambda mask, x, y: jax.tree.map(lambda x, y: xp.where(mask, x, y), x, y)  # noqa: E731
-    return choose(state.done, state, choose(goes, moved, fails))
+    return choose(goes, moved, fails)
 
 
 def _end_of_work(before: Any, work: Any, power: Any, xp: ModuleType) -> Any:

@@ -99,8 +99,8 @@ def test_equalities_of_a_complementarity_problem_hold_besides_its_inequalities()
     W, b = U @ U.swapaxes(1, 2), rng.normal(size=(n, E)) * np.linalg.norm(U, axis=2)
     equal = rng.uniform(size=(n, E)) < 0.4
     allowed = (rng.uniform(size=(n, E)) < 0.8) & ~equal
-    by_numpy = solve_complementarity(W, b, allowed, np.zeros((n, E)), np, equal)
-    solve = jax.jit(lambda W, b: solve_complementarity(W, b, jnp.asarray(allowed), jnp.zeros((n, E)), jnp, jnp.asarray(equal)))
+    by_numpy = solve_complementarity(W, b, allowed, np.zeros((n, E)), equal, np)
+    solve = jax.jit(lambda W, b: solve_complementarity(W, b, jnp.asarray(allowed), jnp.zeros((n, E)), jnp.asarray(equal)))
     by_jax = solve(W, b)
     negative = 0
     for k in range(n):

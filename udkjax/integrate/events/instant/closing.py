@@ -55,6 +55,6 @@ def close_contacts(system: System, gaps: Gaps, after: RunState) -> Float[Any, "*
     least = CARRIED * diagonal(W, xp)
     remainder, closes = eliminate(W, rests, least, xp)
     counts = counts & (diagonal(remainder, xp) > least)
-    solution = solve_complementarity(W, b, counts, floor, xp, closes)
+    solution = solve_complementarity(W, b, counts, floor, closes, xp)
     is_pushed = xp.any(solution.passive & ~closes, axis=-1)[..., None]
     return after.q + xp.where(is_pushed, (solution.x[..., None, :] @ directions)[..., 0, :], 0.0)
