@@ -13,9 +13,9 @@ STACK, PAGE, LINE = 2**20, 2**16, 64
 
 
 class Host:
-    """An instance of a module, and calls of its exports."""
+    """An instance of a module, and calls of its exports; `imports` are functions of an address, beside those of memory."""
 
-    def __init__(self, code: bytes, data_end: int):
+    def __init__(self, code: bytes, data_end: int, imports: Mapping[str, Callable[[int], None]] | None = None):
         store = self.store = wasmtime.Store()
         module = wasmtime.Module(store.engine, code)
         self._start = self._end = -(-(data_end + STACK) // LINE) * LINE
@@ -23,7 +23,7 @@ class Host:
         kinds = {"i32": wasmtime.ValType.i32(), "i64": wasmtime.ValType.i64(), "f64": wasmtime.ValType.f64()}
         pointer = wasmtime.Global(store, wasmtime.GlobalType(kinds["i32"], True), wasmtime.Val.i32(self._start))
         given = {"__linear_memory": self.memory, "__stack_pointer": pointer}
-        functions = {"malloc": self._reserve, "free": lambda address: None}
+        functions = {"malloc": self._reserve, "free": lambda address: None, **(imports or {})}
         for imported in module.imports:
             if imported.name not in given:
                 given[imported.name] = wasmtime.Func(store, imported.type, functions[imported.name])

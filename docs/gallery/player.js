@@ -71,7 +71,7 @@ class Run {
   }
   /** The coordinates and their rates at any time between the first and the last instant. */
   state(t) { return stateAt(this, t, this.size); }
-  /** The joints that stick at a time; those of a motion computed in the page never do. */
+  /** The joints that stick at a time. */
   stuck(t) { return (this.sticking ?? []).filter(({spans}) => spans.some(([from, to]) => from <= t && t <= to)); }
   find(t) { return interval(this.ts, t); }
   /** The coordinates x, y, angle of each body in turn; the next call reuses the array. */
@@ -698,157 +698,146 @@ class GapMarks {
     this.button = button("Least gap", `go to the least gap: ${least.words} (G)`, this.show);
   }
 }
-/** The conditions at a state, with their rates, the effect of impulses along them, and their scales: the change of each by a
- *  displacement of one length or a turn of one radian, which never becomes smaller than in `before`. */
-function evaluate(engine, numbers, settings, state, before) {
-  const {tolerances: {zero}} = engine.data.events, found = engine.conditions(numbers, settings, state), rate = settings.omega;
-  const largest = (slopes, size) => slopes.reduce((most, slope, i) => Math.max(most, Math.abs(slope * size(i)) || 0), 0);
-  found.scales = Array.from(found.g, (_, k) => Math.max(Math.abs(found.byT[k]) * Math.max(1 / rate, Math.abs(state.t)),
-    largest(found.byQ[k], i => Math.max(engine.unit(i), Math.abs(state.q[i]))),
-    largest(found.byV[k], i => Math.max(engine.unit(i) * rate, Math.abs(state.v[i]))), before?.scales[k] ?? 0));
-  found.sides = Array.from(found.g, (g, k) => (Number.isFinite(g) ? (Math.abs(g) > zero * found.scales[k] ? Math.sign(g) : 0) : NaN));
-  return found;
-}
-/** The velocities after an impact of contact k by Newton's law, g_dot+ = -e g_dot-, whether it `hits`, and whether it then `rests`;
- *  or, in `words`, why a page cannot compute it, as for several contacts hit at once. The contact `held` is at rest. */
-function hit(engine, numbers, settings, at, watch, k, held) {
-  const {events} = engine.data, {tolerances: tol} = events, {omega} = settings, {g, rate, rate2, scales, byQ, directions} = watch;
-  const W = along(watch, k, k), unit = j => scales[j] * omega;
-  const isHit = j => j !== k && j !== held && events.restitution[j] !== null && Math.abs(g[j]) <= tol.closed * scales[j]
-    && rate[j] <= tol.zero_rate * unit(j) && Math.abs(along(watch, j, k)) > tol.coupled * Math.sqrt(along(watch, j, j) * W);
-  const other = events.names.findIndex((_, j) => isHit(j)), name = events.names[k];
-  if (other >= 0) return {words: `${name} and ${events.names[other]} are hit at once, which a live page cannot compute yet`};
-  const inverse = engine.inverseMasses(numbers);
-  if (!(W > tol.blocked * byQ[k].reduce((sum, x, i) => sum + x * x * inverse[i], 0))) return {words: `the joints allow no motion at the contact ${name}`};
-  const floor = tol.zero_rate * unit(k), isPressed = acceleration => acceleration < -tol.zero_rate_2 * unit(k) * omega;
-  const isSlow = Math.abs(rate[k]) < tol.rest * unit(k) && isPressed(rate2[k]);
-  const impulse = Math.max(0, -(1 + (isSlow ? 0 : events.restitution[k])) * rate[k] / W), after = rate[k] + W * impulse;
-  const moved = size => at.v.map((x, i) => x + size * directions[k][i]), v = moved(impulse), hits = !isSlow && rate[k] < -floor;
-  const stays = after <= Math.max(floor, tol.still * Math.abs(rate[k]), tol.rest * unit(k));
-  const rests = stays && isPressed(engine.conditions(numbers, settings, {...at, v}).rate2[k]);
-  return {v: rests ? moved(-rate[k] / W) : v, hits, rests};
-}
-/** The change of the rate of contact i by a unit impulse along contact j. */
-const along = ({byQ, directions}, i, j) => byQ[i].reduce((sum, x, r) => sum + x * directions[j][r], 0);
-/** `Engine.run` for an engine with events; these stop the motion only if `stops`. While a contact is at rest, the engine that holds
- *  it runs; `numbersOf` returns the numbers of an engine. */
-function runWithEvents(free, numbersOf, {smallest, omega}, state, ts, stops, limit) {
-  const {data: {events, scales, drift_tol: driftTol}, size: n} = free, T = ts.length, end = ts[T - 1], E = events.names.length;
-  const {zero, zero_rate: zeroRate, zero_rate_2: zeroRate2} = events.tolerances, isImpact = k => events.restitution[k] !== null;
-  const found = {ts, q: new Float64Array(T * n), v: new Float64Array(T * n), violation: new Float64Array(T), held: new Int16Array(T), count: 0,
-    events: [], steps: 0, tried: 0, done: false, limited: false, words: "", stop: null};
-  let at = {...state, t: ts[0]}, watch = state.watch, violation = 0, first = 0, pending = -1;
-  let held, engine, numbers, settings;
-  const use = k => {
-    held = k;
-    engine = k < 0 ? free : free.held[k];
-    numbers = numbersOf(engine);
-    settings = {...engine.data.settings, smallest, omega};
-  };
-  const put = (row, q, v, open) => { found.q.set(q, row * n); found.v.set(v, row * n); found.violation[row] = open; found.held[row] = held + 1; };
-  const finish = (words, more = {}) => Object.assign(found, {words, t: at.t, last: {...at, watch, held}, marks: held < 0 ? at.marks : null, ...more});
-  const note = index => found.events.push({t: at.t, index, q: at.q, v: at.v});
-  const stop = words => {  // with the current state as the last output
-    if (first < T && !(first && ts[first - 1] === at.t)) {
-      ts[first] = at.t;
-      put(first++, at.q, at.v, violation);
-    }
-    return finish(words, {stop: stops ? words : null, count: first});
-  };
-  /** Continue with a contact at rest, or with none. */
-  const rest = (k, v = at.v) => {
-    use(k);
-    at = {t: at.t, q: at.q, v};
-    const {sides} = watch;
-    watch = Object.assign(evaluate(engine, numbers, settings, at, watch), {sides});
-  };
-  use(state.held ?? -1);
-  if (!watch) {
-    watch = evaluate(engine, numbers, settings, at, null);
-    const beyond = watch.sides.findIndex((side, k) => isImpact(k) && side < 0);
-    if (beyond >= 0) return finish(`it begins beyond the contact ${events.names[beyond]}`);
-    const {rate, rate2, scales: unit, sides} = watch, small = k => zeroRate * unit[k] * omega;
-    const falls = k => rate[k] < -small(k) || (Math.abs(rate[k]) <= small(k) && rate2[k] < -zeroRate2 * unit[k] * omega ** 2);
-    pending = sides.findIndex((side, k) => isImpact(k) && side === 0 && falls(k));  // a closed contact that closes further
-    watch.sides = sides.map((side, k) => (isImpact(k) && side === 0 ? 1 : side));
+/** The block of numbers of a run: its parts by name, each an array in the memory of the module. */
+class Block {
+  constructor(instance) {
+    this.instance = instance;
+    instance.begin();
+    this.address = instance.reserve(8 * instance.module.size);
+    instance.view(this.address, instance.module.size).fill(0);
   }
+  part(name) {
+    const [place, size] = this.instance.module.places[name];
+    return this.instance.view(this.address + 8 * place, size);
+  }
+  put(name, numbers) { this.part(name).set(numbers); }
+  number(name) { return this.part(name)[0]; }
+  /** Copies of parts, by name. */
+  copies(names) { return Object.fromEntries(names.map(name => [name, this.part(name).slice()])); }
+}
+/** The motion of one run: its block of numbers, and what the module `instants` asks for. */
+class EventMotion {
+  constructor(engine, numbers, settings) {
+    Object.assign(this, {engine, numbers, settings, events: engine.data.events, marks: new Map()});
+    this.instants = engine.instances.instants;
+    this.instants.imports = {look: () => this.look(), project: () => this.project()};
+    this.block = new Block(this.instants);
+    const [conditions, actions, joints] = engine.numbersOfEvents(numbers);
+    this.conditions = conditions;
+    this.block.put("of_actions", actions);
+    this.block.put("joint_numbers", joints);
+    this.block.put("coordinates", Float64Array.from({length: engine.size}, (_, i) => engine.unit(i)));
+    this.block.put("inverse_mass", engine.inverseMasses(numbers));
+    this.block.put("rate", [settings.omega]);
+  }
+  /** The state at which a function of the host is asked. */
+  get at() {
+    const [t, q, v, phase, joints] = ["t", "q", "v", "phase", "joints"].map(name => this.block.part(`at_${name}`).slice());
+    return {t: t[0], q, v, mode: {phase, joints}};
+  }
+  /** The state with its numbers and with the marks of its phase, which are found where the phase is entered first. */
+  dressed({mode, ...state}) {
+    const numbers = this.engine.inMode(this.numbers, mode), key = mode.phase.join();
+    if (!this.marks.has(key)) this.marks.set(key, this.engine.markRows(numbers, state));
+    return [numbers, {...state, marks: this.marks.get(key)}];
+  }
+  look() { this.block.put("look", this.engine.evaluate("states", this.settings, ...this.dressed(this.at))); }
+  project() { this.block.put("project", this.engine.evaluate("project", this.settings, ...this.dressed(this.at))); }
+  /** The present mode; the same object as long as it stays. */
+  get mode() {
+    const mode = this.block.copies(["phase", "joints"]), same = (x, y) => x.every((value, k) => Object.is(value, y[k]));
+    if (!this.latest || !same(mode.phase, this.latest.phase) || !same(mode.joints, this.latest.joints)) this.latest = mode;
+    return this.latest;
+  }
+  /** Integrate to the next crossing, at most to the last of `times`. */
+  advance(times, limit) {
+    const {block, events, engine} = this, {scales} = engine.data, pick = (x, of) => of.map(k => x[k]), E = events.zeros.length;
+    const state = {t: times[0], q: block.part("q").slice(), v: block.part("v").slice(), mode: this.mode}, scale = block.part("scale");
+    const floors = events.zeros.map((zero, k) => zero * scale[k]);
+    const force = events.zero * scales.mass * scales.length * this.settings.omega ** 2, forces = events.watched.slice(E).map(() => force);
+    const watch = [...this.conditions, ...pick(block.part("sides"), events.watched), ...pick(block.part("watched"), events.watched),
+      ...floors, ...forces, ...events.directions, events.slowest];
+    const [numbers, dressed] = this.dressed(state), part = engine.piece(numbers, this.settings, dressed, times, limit, watch), n = engine.size;
+    const [crossed, t, worst] = part.crossing;
+    block.put("t", [t]);
+    block.put("q", part.crossing.subarray(-2 * n, -n));
+    block.put("v", part.crossing.subarray(-n));
+    block.put("event", [crossed < 0 ? events.no_event : events.watched[crossed]]);
+    events.watched.forEach((k, place) => { block.part("sides")[k] = part.crossing[events.head + place]; });
+    return {...part, crossed: crossed >= 0, sure: t, worst};
+  }
+  /** Apply what happens at an instant, by `begin` or `settle`; returns the events {t, index, q, v}, with their states before. */
+  apply(name) {
+    const {block, instants, engine: {size: n}} = this;
+    instants.exports[name](block.address);
+    const count = block.number("events"), of = part => block.part(`events_${part}`), times = of("time"), names = of("name"), q = of("q"), v = of("v");
+    return Array.from({length: count}, (_, k) => ({t: times[k], index: names[k], q: q.slice(k * n, (k + 1) * n), v: v.slice(k * n, (k + 1) * n)}));
+  }
+}
+/** `Engine.run` for an engine with events; these stop the motion only if `stops`. */
+function runWithEvents(engine, numbers, settings, state, ts, stops, limit) {
+  const {data: {events, drift_tol: driftTol}, size: n} = engine, T = ts.length, end = ts[T - 1], {results} = events;
+  const run = new EventMotion(engine, numbers, settings), {block} = run;
+  const found = {ts, q: new Float64Array(T * n), v: new Float64Array(T * n), violation: new Float64Array(T), modes: Array(T).fill(null), count: 0,
+    events: [], steps: 0, tried: 0, done: false, limited: false, words: "", stop: null};
+  let first = 0, violation = 0, mode = null;
+  const put = (row, q, v, open) => { found.q.set(q, row * n); found.v.set(v, row * n); found.violation[row] = open; found.modes[row] = mode; };
+  const now = () => block.number("t"), putNow = () => put(first++, block.part("q"), block.part("v"), violation);
+  const finish = (words, more = {}) => {
+    const last = {t: now(), q: block.part("q").slice(), v: block.part("v").slice(), mode, watch: block.copies(events.kept)};
+    last.marks = run.dressed(last)[1].marks;
+    return Object.assign(found, {words, t: last.t, last, marks: last.marks, count: first, ...more});
+  };
+  const stop = words => {  // with the current state as the last output
+    if (first < T && !(first && ts[first - 1] === now())) {
+      ts[first] = now();
+      putNow();
+    }
+    return finish(words, {stop: stops ? words : null});
+  };
+  const nameOf = index => events.names[index];
+  for (const [name, x] of Object.entries(state.watch ?? events.starts)) block.put(name, x);
+  if (state.watch) {  // it goes on from the end of another run
+    block.put("running", [1]);
+    block.put("code", [results.successful]);
+    block.put("event", [events.no_event]);
+  } else block.put("joints", engine.jointsIn(numbers));
+  block.put("t", [ts[0]]);
+  block.put("q", state.q);
+  block.put("v", state.v);
+  block.put("end", [end]);
+  if (!state.watch && run.instants.exports.begin) run.apply("begin");
   for (;;) {
-    while (first < T && ts[first] <= at.t) put(first++, at.q, at.v, violation);
-    found.count = first;
-    const noNumber = watch.sides.findIndex(Number.isNaN);
-    if (noNumber >= 0) return finish(`the condition of ${events.names[noNumber]} is not a number`);
-    if (end - at.t <= 2 * settings.smallest) {
-      while (first < T) put(first++, at.q, at.v, violation);
-      return finish("", {done: true, count: T});
+    if (block.number("running")) found.events.push(...run.apply("settle"));
+    mode = run.mode;
+    if (block.number("code") === results.event_stop && !stops) {
+      block.put("code", [results.successful]);
+      block.put("running", [now() < end ? 1 : 0]);
     }
-    let event = pending, before = watch.sides, part = null;
-    pending = -1;
-    if (event < 0) {
-      const times = Float64Array.of(at.t, ...ts.subarray(first)), floors = watch.scales.map(x => zero * x), isHeld = held < 0 ? [] : [1];
-      const counts = before.map((_, k) => (k === held ? 0 : 1)), force = zero * scales.mass * scales.length * omega ** 2;
-      const given = [...engine.conditionNumbers(numbers), ...before, ...isHeld, ...counts, ...isHeld, ...floors, ...isHeld.map(() => force),
-        ...events.directions, ...isHeld.map(() => -1), events.slowest];
-      part = engine.piece(numbers, settings, at, times, limit - found.tried, given);
-      const [crossed, sure, worst] = part.crossing;
-      before = [...part.crossing.subarray(events.head, events.head + E)];
-      found.steps += part.steps;
-      found.tried += part.tried;
-      for (let k = 1; k < part.count && times[k] <= sure; k++) {
-        put(first, part.q.subarray(k * n, (k + 1) * n), part.v.subarray(k * n, (k + 1) * n), part.violation[k]);
-        found.count = ++first;
+    const code = block.number("code");
+    while (first < T && ts[first] <= now()) putNow();
+    if (!block.number("running")) {
+      const lastEvent = found.events.at(-1);
+      if (code === results.successful) {
+        while (first < T) putNow();
+        return finish("", {done: true});
       }
-      at = {t: sure, q: part.crossing.slice(-2 * n, -n), v: part.crossing.slice(-n), marks: part.marks};
-      violation = worst;
-      if (!(worst <= driftTol)) return finish("the loops do not stay closed");
-      event = crossed;
-      watch = evaluate(engine, numbers, settings, at, watch);
+      if (code === results.event_stop) return stop(`stopped by ${nameOf(lastEvent.index)}`);
+      if (code === results.at_rest) return stop(`${nameOf(lastEvent.index).replace(/ rests$/, "")} has come to rest`);
+      if (code === results.undefined_condition) return finish(`the condition of ${nameOf(block.part("undefined").findIndex(x => x > 0))} is not a number`);
+      return finish(events.words[code] ?? "an event is impossible");
     }
-    if (event === E) {  // the contact would have to pull
-      before[held] = 1;
-      note(E + held);
-      watch.sides = before;
-      rest(-1);
-      continue;
-    }
-    let lifted = -1;  // contact lifted by the impact of another
-    if (event >= 0 && isImpact(event) && held >= 0) {
-      const bare = evaluate(free, numbersOf(free), settings, {t: at.t, q: at.q, v: at.v}, watch);
-      if (along(bare, held, event) > events.tolerances.coupled * Math.sqrt(along(bare, held, held) * along(bare, event, event))) {
-        lifted = held;
-        before[held] = 1;
-        rest(-1);
-      }
-    }
-    const jump = event >= 0 && isImpact(event) ? hit(engine, numbers, settings, at, watch, event, Math.max(held, lifted)) : null;
-    if (jump?.words) return finish(jump.words);
-    if (event >= 0 && (!jump || jump.hits || !jump.rests)) note(event);
-    if (lifted >= 0) note(E + lifted);
-    if (jump) {
-      at = {...at, v: jump.v};
-      if (jump.rests) {
-        note(2 * E + event);
-        const words = `${events.names[event]} has come to rest`;
-        if (events.ends_at_rest[event]) return stop(words);
-        if (!free.held[event]) return finish(`${words}, where a live page cannot hold it`);
-        if (held >= 0) return finish(`${words} as well as ${events.names[held]}; a live page cannot hold two contacts at rest yet`);
-        before[event] = 1;
-        watch.sides = before;
-        rest(event);
-        continue;
-      }
-      watch = evaluate(engine, numbers, settings, at, watch);
-    }
-    watch.sides = watch.sides.map((side, k) => {
-      if (k === event) return jump ? 1 : -before[k];
-      if (k === held) return 1;
-      return Number.isNaN(side) || (side !== 0 && !(jump && events.by_velocity[k])) ? side : before[k];
-    });
-    if (event < 0) {
-      if (part.done) continue;
-      return finish(part.words, {limited: part.limited});
-    }
-    if (events.stops[event] && stops) return stop(`stopped by ${events.names[event]}`);
     if (found.events.length >= events.most) return finish(`more than ${events.most} events`);
+    if (block.number("event") !== events.no_event) continue;  // another event at the same instant
+    const times = Float64Array.of(now(), ...ts.subarray(first)), part = run.advance(times, limit - found.tried);
+    found.steps += part.steps;
+    found.tried += part.tried;
+    for (let k = 1; k < part.count && times[k] <= part.sure; k++) {
+      put(first++, part.q.subarray(k * n, (k + 1) * n), part.v.subarray(k * n, (k + 1) * n), part.violation[k]);
+    }
+    violation = part.worst;
+    if (!(part.worst <= driftTol)) return finish("the loops do not stay closed");
+    if (!part.done && !part.crossed) return finish(part.words, {limited: part.limited});
   }
 }
 const STACK = 1 << 20, PAGE = 1 << 16, LINE = 64;  // bytes: more than any stack needs, the unit in which memory grows, alignment
@@ -870,6 +859,7 @@ class Instance {
     found.start = Math.ceil((module.data_end + STACK) / LINE) * LINE;
     found.memory = new WebAssembly.Memory({initial: Math.ceil(found.start / PAGE) + 1});
     const env = {__linear_memory: found.memory, malloc: size => found.reserve(Number(size)), free: () => {}};
+    for (const name of ["look", "project"]) env[name] = () => found.imports[name]();  // set by each run
     env.__stack_pointer = new WebAssembly.Global({value: "i32", mutable: true}, found.start);
     const {instance} = await WebAssembly.instantiate(await inflate(module.code), {env});
     found.exports = instance.exports;
@@ -923,10 +913,21 @@ class Engine {
     module.exports.numbers(given, to);
     return module.view(to, this.base.length).slice();
   }
-  conditionNumbers(numbers) {
-    const {count, knots, conditions} = this.data;
-    return numbers.subarray(count + knots, count + knots + conditions);
+  /** The numbers of conditions, of actions, and of joints that events add. */
+  numbersOfEvents(numbers) {
+    let place = this.data.count + this.data.knots;
+    return this.data.of_events.map(size => numbers.subarray(place, place += size));
   }
+  /** Numbers in another mode {phase, joints}: the constraints that hold, and the numbers of joints that events have added. */
+  inMode(numbers, mode) {
+    if (!mode) return numbers;
+    const found = numbers.slice(), {switches, joints} = this.data.events;
+    joints.forEach((place, k) => { if (place >= 0) found[place] = mode.joints[k]; });
+    switches.forEach(([place, k]) => { found[place] = mode.phase[k]; });
+    return found;
+  }
+  /** The numbers of joints that events have added. */
+  jointsIn(numbers) { return Float64Array.from(this.data.events.joints, place => (place < 0 ? 0 : numbers[place])); }
   /** All numbers of the scene, with the spring that pulls a body. */
   pulled(parameters, pull) {
     const numbers = this.numbers(parameters);
@@ -939,7 +940,7 @@ class Engine {
   dressed(numbers, thresholds, t, marks = null) {
     const {count} = this.data, found = new Float64Array(count + (marks?.length ?? 0) + 2);
     found.set(numbers.subarray(0, count));
-    if (marks) found.set(marks, count);
+    if (marks) found.set(this.data.shared ? this.data.rows.map(unit => this.data.scales.length / unit) : marks, count);
     found.set(thresholds, found.length - 2);
     const passed = this.breaks(numbers).filter(b => b <= t).length;
     this.data.sampled.forEach((place, k) => { found[place] = this.samples[passed * this.row + k]; });
@@ -977,6 +978,11 @@ class Engine {
     const inputs = {numbers: given, ts: [t, t], q, v, settings, rows: data.rows, breaks: []};
     return this.instances.mark.run(inputs, {marks: data.marks}, {times: 2, knots: 0}).marks;
   }
+  /** Why the friction of joints cannot be computed: redundant rows share their loads, and the engine has code for some of them. */
+  otherShares(numbers, state) {
+    const {shared} = this.data, marks = shared && this.markRows(numbers, state);
+    return marks && marks.some((mark, k) => (mark === 0) !== shared.includes(k)) ? "with these numbers other constraints are redundant, and share loads that friction depends on" : "";
+  }
   /** Integrate the motion from a closed state {q, v} at times[0]; missing `marks` of the state are computed.
    *
    *  `pull` is a spring {body, point, target, stiffness, damping} that pulls a body (its index): point in its frame and target in
@@ -984,17 +990,20 @@ class Engine {
    *  `limit` is the largest number of attempted steps, by default 20,000; a run that reaches it can continue from its `last` state.
    *  Returns the times ts, q and v, and the `violation` of Psi (in units of the scene), of which the first `count` are valid;
    *  `done`, and if it is false the reason in `words`; the number of `steps`; the `last` state; its `marks`; and `events`, a list of
-   *  {t, index, q, v}, where the number of events is added to the index of a contact that lets go, and twice this number if it comes
-   *  to rest. If an event stops the motion, `stop` is the reason, and the last time is that of the event. `held` is, at each time,
-   *  the index of the event whose contact is at rest plus one, or 0.
+   *  {t, index, q, v}, where `index` is that of a name in `data.events.names`. If an event stops the motion, `stop` is the reason, and
+   *  the last time is that of the event. `modes` has, for each time, which constraints hold; parts of a motion in one mode share it.
    */
   run(parameters, state, times, pull = null, limit = this.data.settings.max_steps) {
     const {data} = this, T = times.length;
     if (data.why) throw new Error(data.why);
     const end = Math.max(Math.abs(times[0]), Math.abs(times[T - 1])), smallest = data.smallest * EPS * end;
     const omega = Math.max(data.scales.rate, largest(state.v, this.unit), 1 / (times[T - 1] - times[0]));
-    if (data.events) return runWithEvents(this, engine => engine.pulled(parameters, pull), {smallest, omega}, state, Float64Array.from(times), !pull, limit);
-    return {...this.piece(this.pulled(parameters, pull), {...data.settings, smallest, omega}, state, Float64Array.from(times), limit), events: []};
+    const numbers = this.pulled(parameters, pull), settings = {...data.settings, smallest, omega};
+    const others = this.otherShares(numbers, {t: times[0], ...state});
+    if (others) return {ts: Float64Array.from(times), q: new Float64Array(T * this.size), v: new Float64Array(T * this.size), violation: new Float64Array(T),
+      count: 0, done: false, words: others, t: times[0], steps: 0, tried: 0, limited: false, last: {t: times[0], ...state}, marks: null, events: []};
+    if (data.events) return runWithEvents(this, numbers, settings, state, Float64Array.from(times), !pull, limit);
+    return {...this.piece(numbers, settings, state, Float64Array.from(times), limit), events: []};
   }
   /** Integrate from a state over times, up to the first zero `crossing` of the conditions in `watch`. */
   piece(numbers, settings, state, ts, limit, watch = []) {
@@ -1002,7 +1011,7 @@ class Engine {
     const inputs = {numbers: this.dressed(numbers, data.thresholds, ts[0], marks), ts, q: state.q, v: state.v,
       settings: Object.values({...settings, max_steps: limit}), rows: data.rows, breaks, samples: this.samples, watch};
     const info = data.info.length, results = {qs: T * size, vs: T * size, violation: T, info: info + 2 * size};
-    if (data.events) results.crossing = data.events.head + data.events.names.length + data.forces_watched + 2 * size;
+    if (data.events) results.crossing = data.events.head + data.events.watched.length + 2 * size;
     const found = this.instances.run.run(inputs, results, {times: T, knots: breaks.length});
     const ended = Object.fromEntries(data.info.map((name, k) => [name, found.info[k]]));
     const status = STATUSES[ended.code], limited = status === "step_limit";
@@ -1012,20 +1021,12 @@ class Engine {
     return {ts, q: found.qs, v: found.vs, violation: found.violation, count, done, words, t: ended.t,
       steps: ended.accepted, tried: ended.tried, limited, last, marks, crossing: found.crossing};
   }
-  /** The conditions of events at a state: g, its first and second rates, derivatives with respect to t, q and v, and for each
-   *  impact the velocities due to a unit impulse along it. */
-  conditions(numbers, settings, state) {
-    const {data: {events, rows}, size: n, instances: {states}} = this, E = events.names.length, {t, q, v} = state;
-    const impacts = events.restitution.map((e, k) => (e === null ? -1 : k)).filter(k => k >= 0);
-    const marks = state.marks ?? this.markRows(numbers, state), total = n + 4 * E + 2 * E * n + impacts.length * n;
-    const inputs = {numbers: this.dressed(numbers, this.data.thresholds, t, marks), ts: [t, t], q, v, rows, breaks: [],
-      settings: states.module.settings.map(name => settings[name]), event_numbers: [...this.conditionNumbers(numbers), ...this.inverseMasses(numbers)]};
-    const {found} = states.run(inputs, {found: total}, {times: 2, knots: 0});
-    let place = n;
-    const take = size => found.slice(place, place += size), rowsOf = () => Array.from({length: E}, () => take(n));
-    const known = {g: take(E), rate: take(E), rate2: take(E), byT: take(E), byQ: rowsOf(), byV: rowsOf()}, directions = [];
-    for (const k of impacts) directions[k] = take(n);
-    return {...known, directions};
+  /** Evaluate a module at a state: `states`, the conditions of events, or `project`. */
+  evaluate(name, settings, numbers, {t, q, v, marks}) {
+    const instance = this.instances[name], {module} = instance, [conditions] = this.numbersOfEvents(numbers);
+    const inputs = {numbers: this.dressed(numbers, this.data.thresholds, t, marks), ts: [t, t], q, v, rows: this.data.rows, breaks: [],
+      settings: module.settings.map(name => settings[name]), event_numbers: [...conditions, ...this.inverseMasses(numbers)]};
+    return instance.run(inputs, {found: module.count}, {times: 2, knots: 0}).found;
   }
   /** One over the mass, or the inertia, of each coordinate. */
   inverseMasses(numbers) { return this.data.masses.flatMap(([mass, inertia]) => [1 / numbers[mass], 1 / numbers[mass], 1 / numbers[inertia]]); }
@@ -1033,11 +1034,11 @@ class Engine {
    *  friction (W), and the forces x, y (N) of the joints of `data.forces`, for all joints time by time, and accelerations `a`; these
    *  are empty if rows are redundant: forces are not unique. */
   measure(parameters, run, efforts = false, forces = false, accelerations = false) {
-    if (run.held?.subarray(0, run.count).some(k => k > 0)) return this.measureParts(parameters, run, efforts, forces);
-    const {ts, q, v, count, marks = null} = run;
+    if (run.modes) return this.measureParts(parameters, run, efforts, forces);
+    const {ts, q, v, count, mode, marks = null} = run;
     const {data, size} = this, module = this.instances.evaluate, {places} = module.module;
     const rubs = efforts && data.friction, wanted = efforts ? data.efforts.filter(({row}) => !marks || marks[row]) : [], unique = !marks || marks.every(Boolean);
-    const numbers = this.numbers(parameters), breaks = this.row ? this.breaks(numbers) : [];
+    const numbers = this.inMode(this.numbers(parameters), mode), breaks = this.row ? this.breaks(numbers) : [];
     module.begin();
     const given = module.reserve(8 * (data.count + data.marks + 2)), work = module.reserve(8 * module.module.size);
     module.view(work, module.module.size).fill(0);
@@ -1066,15 +1067,14 @@ class Engine {
     }
     return found;
   }
-  /** `measure` for a run in which contacts come to rest: each part of the run is measured by the engine that computed it. */
-  measureParts(parameters, {ts, q, v, count, held, marks}, efforts, forces) {
-    const n = this.size, parts = [];
+  /** `measure` for a run with events: each part of the run, in one mode, by itself. */
+  measureParts(parameters, {ts, q, v, count, modes}, efforts, forces) {
+    const n = this.size, numbers = this.numbers(parameters), parts = [];
     for (let from = 0, to = 0; from < count; from = to) {
-      while (to < count && held[to] === held[from]) to++;
-      const part = {ts: ts.subarray(from, to), q: q.subarray(from * n, to * n), v: v.subarray(from * n, to * n), count: to - from, marks};
-      const engine = held[from] ? this.held[held[from] - 1] : this;
-      if (held[from]) part.marks = engine.mark(parameters, {t: ts[from], q: part.q.subarray(0, n), v: part.v.subarray(0, n)});
-      parts.push(engine.measure(parameters, part, efforts, forces));
+      while (to < count && modes[to] === modes[from]) to++;
+      const part = {ts: ts.subarray(from, to), q: q.subarray(from * n, to * n), v: v.subarray(from * n, to * n), count: to - from, mode: modes[from]};
+      part.marks = this.markRows(this.inMode(numbers, part.mode), {t: ts[from], q: part.q.subarray(0, n), v: part.v.subarray(0, n)});
+      parts.push(this.measure(parameters, part, efforts, forces));
     }
     const joined = of => Float64Array.from(parts.flatMap(part => [...of(part)]));
     return {kinetic: joined(p => p.kinetic), potential: joined(p => p.potential),
@@ -1090,10 +1090,9 @@ class Engine {
 }
 /** The engine of a mechanism, from its data. */
 async function loadEngine(data) {
-  if (data.format !== 1) throw new Error(`this engine reads format 1, not ${data.format}`);
+  if (data.format !== 2) throw new Error(`this engine reads format 2, not ${data.format}`);
   const loaded = Object.entries(data.modules).map(async ([name, module]) => [name, await Instance.load(module)]);
   const engine = new Engine(data, Object.fromEntries(await Promise.all(loaded)));
-  engine.held = Object.fromEntries(await Promise.all(Object.entries(data.held).map(async ([k, of]) => [k, await loadEngine(of)])));
   return engine;
 }
 /** Updates the symbols, marks and traces of a run from the numbers of the scene. */
@@ -1156,7 +1155,7 @@ class Hand {
     }
     if (this.isBlocked) live.live.greet();  // replaces the message
     this.isBlocked = false;
-    this.state = {t, q: run.q.slice(n), v: run.v.slice(n), marks: run.marks, watch: run.last.watch, held: run.last.held};
+    this.state = {t, q: run.q.slice(n), v: run.v.slice(n), marks: run.marks, watch: run.last.watch, mode: run.last.mode};
     live.append(this.state, run.violation[1], run.events);
     return null;
   }
@@ -1306,7 +1305,7 @@ class PartRun {
   /** The run of `engine` from a closed state over `times`, with the numbers `values`. */
   constructor(engine, values, state, times) {
     const T = times.length, n = engine.size;
-    const run = {ts: times.slice(), q: new Float64Array(T * n), v: new Float64Array(T * n), violation: new Float64Array(T), held: new Int16Array(T), count: 0, events: []};
+    const run = {ts: times.slice(), q: new Float64Array(T * n), v: new Float64Array(T * n), violation: new Float64Array(T), modes: engine.data.events ? Array(T).fill(null) : null, count: 0, events: []};
     Object.assign(this, {engine, values, state, run, steps: 0, tried: 0, t: times[0], goesOn: true, stands: false, done: false, stop: null, words: ""});
   }
   get most() { return this.engine.data.settings.max_steps; }
@@ -1325,7 +1324,7 @@ class PartRun {
     run.q.set(part.q.subarray(skip * n, (skip + count) * n), from * n);
     run.v.set(part.v.subarray(skip * n, (skip + count) * n), from * n);
     run.violation.set(part.violation.subarray(skip, skip + count), from);
-    if (part.held) run.held.set(part.held.subarray(skip, skip + count), from);
+    if (run.modes) run.modes.splice(from, count, ...part.modes.slice(skip, skip + count));
     run.count = from + count;
     run.events.push(...part.events);
     this.steps += part.steps;
@@ -1361,8 +1360,8 @@ const USUAL = 0.95;  // fraction of the instants without a force above the usual
 class LiveRun {
   /** `live` is the page; `run` is shown; `record` is its data, and `data` its further data for a live page. */
   constructor(live, run, record, data) {
-    const {ts, q, v, measures, frame, reactions, forces, events} = run;
-    Object.assign(this, {live, run, data, player: live.player, ghost: new Run(record), first: {ts, q, v, measures, frame, reactions, forces, events}});
+    const {ts, q, v, measures, frame, reactions, forces, events, sticking} = run;
+    Object.assign(this, {live, run, data, player: live.player, ghost: new Run(record), first: {ts, q, v, measures, frame, reactions, forces, events, sticking}});
     this.times = data.times ? Float64Array.from(data.times) : ts;  // all output times, even if the first motion failed or was stopped
     this.updater = new SymbolUpdater(run, data.symbol_updates);
     Object.assign(this, {changed: false, hand: null, job: null, marks: null});
@@ -1390,7 +1389,8 @@ class LiveRun {
     const {ts, q, v, measures, frame, reactions, forces, events} = this.first;
     this.drop();
     this.run.replace(ts, q, v, measures, frame, events);
-    this.run.held = null;
+    this.run.modes = null;
+    this.run.sticking = this.first.sticking;
     this.showReactions(reactions, forces);
     this.updater.update(this.engine.numbers(null));
     this.changed = false;
@@ -1430,14 +1430,30 @@ class LiveRun {
     const part = {...run, marks: this.marks, ts: cut(run.ts, 1), q: cut(run.q, n), v: cut(run.v, n), violation: cut(run.violation, 1)};
     const found = this.engine.measure(this.values, part, true, Boolean(this.first.reactions));
     this.run.replace(part.ts, part.q, part.v, this.measures(part, found), 1, this.named(run.events));
-    this.run.held = run.held;
+    this.run.modes = run.modes;
+    this.run.sticking = this.stuck(part, this.run.events);
     this.showReactions(this.reactions(found.forces), found.forces);
     this.changed = true;
   }
+  /** The joints that stick, with the spans of time in which they do: from their events, or else from output to output. */
+  stuck({ts, modes}, events) {
+    const {sticking = {}} = this.engine.data.events ?? {};
+    return (this.first.sticking ?? []).map(joint => {
+      const [lock, side] = sticking[joint.name], sticks = mode => Boolean(mode) && (mode.phase[lock] > 0.5 || mode.joints[side] > 0.5), changes = [];
+      ts.forEach((t, k) => {
+        const now = sticks(modes[k]), before = k > 0 && sticks(modes[k - 1]);
+        if (now === before) return;
+        const name = `${joint.name} ${now ? "sticks" : "slips"}`, event = events.findLast(e => e.name === name && e.t >= ts[k - 1] && e.t <= t);
+        changes.push(event?.t ?? t);
+      });
+      if (changes.length % 2) changes.push(ts[ts.length - 1]);
+      return {...joint, spans: Array.from({length: changes.length / 2}, (_, k) => changes.slice(2 * k, 2 * k + 2))};
+    });
+  }
   /** Events in the form in which they are shown, {t, name}. */
   named(events) {
-    const names = this.engine.data.events?.names ?? [], nameOf = k => names[k % names.length] + ["", " lets go", " rests"][Math.floor(k / names.length)];
-    return events.map(({t, index}) => ({t, name: nameOf(index)}));
+    const names = this.engine.data.events?.names ?? [];
+    return events.map(({t, index}) => ({t, name: names[index]}));
   }
   /** The arrows of forces computed in the page; null with redundant constraints, since forces are not unique. */
   reactions(forces) {
@@ -1498,29 +1514,36 @@ class LiveRun {
   /** Begin the record of a pull with the motion up to now. */
   record(state) {
     const {ts, q, v} = this.run, n = this.engine.size, count = ts.findIndex(t => t >= state.t), before = count < 0 ? ts.length : count;
-    const old = this.run.measures.find(m => m.name === "violation")?.values, {length} = this.engine.data.scales;
+    const modes = this.modesBefore(before), old = this.run.measures.find(m => m.name === "violation")?.values, {length} = this.engine.data.scales;
     this.past = {ts: [...ts.slice(0, before)], q: [...q.slice(0, before * n)], v: [...v.slice(0, before * n)],
-      violation: Array.from({length: before}, (_, k) => (old?.[k] ?? 0) / length), held: Array.from({length: before}, (_, k) => this.run.held?.[k] ?? 0)};
+      violation: Array.from({length: before}, (_, k) => (old?.[k] ?? 0) / length), modes: Array.from({length: before}, (_, k) => modes?.[k] ?? null)};
     this.happened = this.run.events.filter(({t}) => t <= state.t);
     this.marks = state.marks ??= this.engine.mark(this.values, state);
     this.append(state, state.violation, []);
   }
+  /** The modes of the first outputs of the motion; of a recorded motion they are computed. */
+  modesBefore(count) {
+    const {run: {modes, ts}, engine, values} = this;
+    if (modes || !engine.data.events || count < 2) return modes;
+    return engine.run(values, this.close(values), ts.subarray(0, count)).modes;
+  }
   /** Add a state, and the events before it, to the record, and show it. */
-  append({t, q, v, held = -1}, violation, events) {
+  append({t, q, v, mode = null}, violation, events) {
     const {past} = this;
     this.happened.push(...this.named(events));
     past.ts.push(t);
     past.q.push(...q);
     past.v.push(...v);
     past.violation.push(violation);
-    past.held.push(held + 1);
+    past.modes.push(mode);
     this.showPast();
     this.player.setEnd(Math.max(t, this.player.data.end));
     this.player.t = t;
     this.player.draw();
   }
   showPast() {
-    const run = Object.fromEntries(Object.entries(this.past).map(([name, x]) => [name, Float64Array.from(x)]));
+    const {modes, ...numbers} = this.past, run = Object.fromEntries(Object.entries(numbers).map(([name, x]) => [name, Float64Array.from(x)]));
+    run.modes = this.engine.data.events ? modes : null;
     this.show({...run, count: run.ts.length, events: []});
     this.run.events = this.happened;
   }
@@ -1533,7 +1556,7 @@ class LiveRun {
       past.q.push(...run.q.subarray(k * n, (k + 1) * n));
       past.v.push(...run.v.subarray(k * n, (k + 1) * n));
       past.violation.push(run.violation[k]);
-      past.held.push(run.held?.[k] ?? 0);
+      past.modes.push(run.modes?.[k] ?? null);
     }
     this.happened.push(...this.named(run.events));
     this.showPast();

@@ -39,7 +39,7 @@ GROUPS = {
     "Friction and impacts": {
         "hammer": ("Hammer", "change the restitution of the anvil"),
         "toggle_clamp": ("Toggle clamp", "compare the dry clamp with the greased one"),
-        "woodpecker": ("Woodpecker", "stop at a peck, when the ring is free"),
+        "woodpecker": ("Woodpecker", "make the spring stiffer, and count the pecks"),
         "rod_on_floor": ("Rod on the floor", "compare the two coefficients when the tip digs in"),
     },
     "Identification": {

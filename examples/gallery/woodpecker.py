@@ -21,6 +21,7 @@ SHAPES = {  # mm
     "ring": [(-BORE, HALF), (BORE, HALF), (BORE, -HALF), (-BORE, -HALF)],
     "bird": [(-12.0, 16.0), BEAK, (-8.0, 24.0), (6.0, 12.0), (4.0, -30.0)],
 }
+LIVE = ["force.spring.stiffness", "gravity[1]"]  # numbers with sliders
 MOMENT = 0.96  # fraction of the motion at which its picture is taken
 
 
@@ -71,7 +72,8 @@ def make():
         "largest gain of energy between two times (J)": float(np.max(np.diff(energy))),
     }
     shapes = {name: 1e-3 * np.array(points) for name, points in SHAPES.items()}
-    return facts, {"motion": udk.animate(mech, sol, shapes=shapes, traces=[("bird", 1e-3 * np.array(BEAK))])}
+    traces = [("bird", 1e-3 * np.array(BEAK))]
+    return facts, {"motion": udk.animate(mech, sol, shapes=shapes, traces=traces, live=LIVE, events=contacts)}
 
 
 if __name__ == "__main__":

@@ -19,9 +19,9 @@ from udkjax.integrate.events.law.event import ExpandsToEvents as ExpandsToEvents
 from udkjax.integrate.events.law.event import expand_events as expand_events
 from udkjax.integrate.events.law.event import listed_events as listed_events
 from udkjax.integrate.portable import drawn_points as drawn_points
+from udkjax.integrate.portable import names_of_run as names_of_run
 from udkjax.integrate.portable import portable_engine as portable_engine
 from udkjax.integrate.portable import scalar_parameters as scalar_parameters
-from udkjax.integrate.portable import unknown_friction as unknown_friction
 from udkjax.integrate.portable.c import export_c as export_c
 from udkjax.integrate.portable.fmi import export_fmu as export_fmu
 from udkjax.integrate.projection import Projection as Projection

@@ -35,11 +35,11 @@ from udkjax.native.position_operations import Close as Close
 from udkjax.native.position_operations import March as March
 from udkjax.native.primitive import native_p as native_p
 from udkjax.native.run.method_code import MethodCode as MethodCode
-from udkjax.native.run.state_functions import Evaluation as Evaluation
 from udkjax.native.runs import RunStates as RunStates
 from udkjax.native.runs import RunWatched as RunWatched
 from udkjax.native.unsupported import unsupported as unsupported
-from udkjax.native.wasm import compile_wasm as compile_wasm
+from udkjax.native.wasm import evaluation_module as evaluation_module
+from udkjax.native.wasm import hosted_module as hosted_module
 from udkjax.native.wasm import wasm_module as wasm_module
 from udkjax.native.watching.conditions import RESOLUTION as RESOLUTION
 from udkjax.native.watching.conditions import Conditions as Conditions

@@ -1,17 +1,12 @@
 """Motions in closed form with each engine: machine code, diffrax with events in plain form, and WebAssembly."""
 
-import json
-import shutil
-import subprocess
-
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
 import udkjax as udk
 from tests.integrate.motions.exact_motions import EXACT
-from udkjax.integrate.portable import portable_engine
-from udkjax.show.player.page import module
+from tests.page_host import page_run
 
 TOL = 1e-10
 
@@ -28,19 +23,9 @@ def by_simulate(engine):
 
 def by_page(scene, folder):
     """The motion computed by Node.js with the modules of a page: its engine, and its event loop in JavaScript."""
-    if (node := shutil.which("node")) is None:
-        pytest.skip("node is not installed")
-    engine = portable_engine(scene.mechanism, rtol=TOL, atol=TOL, events=scene.events)
-    script = f"""
-        const engine = await loadEngine({json.dumps(engine.data)}), times = Float64Array.from({json.dumps(scene.ts.tolist())});
-        const found = engine.run(null, engine.close(), times);
-        console.log(JSON.stringify({{q: [...found.q], done: found.done, words: found.words, times: found.events.map(e => e.t)}}));
-    """
-    (folder / "script.mjs").write_text(module() + script, encoding="utf-8")
-    done = subprocess.run([node, folder / "script.mjs"], capture_output=True, text=True, check=True)
-    found = json.loads(done.stdout)
+    found = page_run(scene.mechanism, scene.ts, scene.events, folder, TOL)
     assert found["done"], found["words"]
-    return np.reshape(found["q"], (len(scene.ts), 3)), found["times"]
+    return found["q"][:, 0], [t for _, t in found["events"]]
 
 
 ENGINES = {"native": by_simulate("native"), "jax": by_simulate("jax"), "page": by_page}

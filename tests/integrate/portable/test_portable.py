@@ -25,10 +25,10 @@ def test_parameters_are_named_one_number_at_a_time():
     assert own == {**every, "body.crank.mass": 3.0} and "body.crank.mass" not in every
 
 
-def test_a_page_refuses_friction_whose_loads_redundant_rows_share():
-    mechanism = rubbing(udk.library.parallelogram())
-    assert "rows that may be redundant share these" in portable_engine(mechanism).data["why"]
-    assert portable_engine(rubbing(udk.library.four_bar()), runs=False).data["why"] == ""
+def test_an_engine_has_code_for_the_redundant_rows_that_share_loads():
+    engine = portable_engine(rubbing(udk.library.parallelogram()))
+    assert engine.data["shared"] and not engine.data["why"]
+    assert portable_engine(rubbing(udk.library.four_bar()), runs=False).data["shared"] is None
 
 
 @pytest.mark.parametrize("name", ["pin.Q", "pin.P[2]", "pin.P[0][0]", "body.crank.mas"])
@@ -154,16 +154,8 @@ def test_numbers_of_conditions_follow_those_of_the_mechanism():
         {"slide": udk.Prismatic(("ground", "block"), [(0.0, 0.0), (0.0, 0.0)], axis=0.2)},
     )
     engine = portable_engine(mechanism, [axis], events=[Passes()])
-    numbers = engine.numbers([0.7])[engine.numbers.count + engine.numbers.knots :]
+    first, count = engine.numbers.count + engine.numbers.knots, engine.data["of_events"][0]
+    numbers = engine.numbers([0.7])[first : first + count]
     changed = Passes().expand(mechanism.with_parameters({axis: 0.7}))
     assert_array_equal(numbers, np.concatenate([np.ravel(x) for x in condition_numbers(changed)]))
     assert 0.7 in numbers and 0.2 not in numbers
-
-
-def test_what_no_page_can_do_is_named():
-    pendulum = udk.library.simple_pendulum()
-    cut = udk.Event(lambda t, at: at["bob"].x, udk.Release("rod"), name="cut")
-    with pytest.raises(ValueError, match=r'the jump of event "cut" \(Release\) cannot run in a page yet'):
-        portable_engine(pendulum, events=[cut])
-    with pytest.raises(ValueError, match=r'cannot compute friction of contacts \("foot"\) yet: leave out their coefficients'):
-        portable_engine(pendulum, events=[udk.Contact("bob", [0, 0], coefficient=0.3, name="foot")])

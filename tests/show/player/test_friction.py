@@ -38,21 +38,6 @@ def test_a_ring_is_around_a_joint_while_it_sticks():
     assert [rings(svg(shown, t)) for t in (0.0, 0.3)] == [0, 1]
 
 
-def test_a_live_page_refuses_what_sticks_and_names_the_cure():
-    ts, still = np.arange(3.0), np.zeros((3, 1, 3))
-    motion: Any = SimpleNamespace(ts=ts, q=still, v=still, events=None, sticking={})
-    with pytest.raises(
-        ValueError, match=r'joints that stick \("pin"\) yet: give their friction law="smooth", or leave out `live`'
-    ):
-        udk.animate(STICKY, motion, measures=(), live=True)
-    body = udk.Mechanism({"box": udk.Body(1.0, 0.1)})
-    contact = udk.Contact("box", coefficient=0.3, name="foot")
-    with pytest.raises(
-        ValueError, match=r'friction of contacts \("foot"\) yet: leave out their coefficients, or leave out `live`'
-    ):
-        udk.animate(body, motion, measures=(), live=["gravity"], events=contact)
-
-
 @pytest.mark.slow
 def test_a_run_that_sticks_is_shown_with_its_rings_and_the_power_of_friction(opened):
     ts = np.linspace(0.0, 8.0, 161)
@@ -82,3 +67,19 @@ def test_a_live_page_computes_the_power_of_friction_again(opened):
         page.evaluate(f"{PLAYER}.live.change({given})")
         found = f"{PLAYER}.live.runs[0].run.measures.find(m => m.name === 'power of friction').values"
         assert_allclose(page.evaluate(f"[...{found}]"), udk.power_balance(other, run).forces["rub"], atol=1e-5)
+
+
+@pytest.mark.slow
+def test_a_live_page_shows_where_joints_stick_with_other_numbers(opened):
+    ts, given = np.linspace(0.0, 8.0, 161), {"force.rub.torque": 0.8}
+    other = STICKY.with_parameters(given)
+    run = udk.simulate(other, ts)
+    (expected,) = udk.animate(other, run).data["runs"][0]["sticking"]
+    with opened(udk.animate(STICKY, udk.simulate(STICKY, ts), live=list(given))) as page:
+        shown = f"{PLAYER}.live.runs[0].run"
+        first = page.evaluate(f"{shown}.sticking[0].spans")
+        page.evaluate(f"{PLAYER}.live.change({given})")
+        assert_allclose(page.evaluate(f"{shown}.sticking[0].spans"), expected["spans"], atol=1e-6)
+        assert_allclose(page.evaluate(f"[...{shown}.q]"), np.ravel(run.q), atol=1e-7)
+        page.locator(".panel canvas").press("Backspace")
+        assert page.evaluate(f"{shown}.sticking[0].spans") == first

@@ -35,8 +35,7 @@ from udkjax.integrate.events.law.event import (
 )
 from udkjax.integrate.events.law.event_plan import event_plan
 from udkjax.integrate.events.law.kinks import FREE, renewed_sides, with_held_forces
-from udkjax.integrate.events.law.phases import SCENE, Phases, phases_of
-from udkjax.integrate.events.law.sticking_joints import with_sticking_joints
+from udkjax.integrate.events.law.phases import SCENE, Phases, events_and_phases
 from udkjax.integrate.events.run.condition_program import watched_conditions, with_cached_functions
 from udkjax.integrate.events.run.host_run import HostRun, concrete_plan, event_arrays
 from udkjax.integrate.events.run.hybrid import Hybrid
@@ -159,10 +158,8 @@ def _expand_concrete(mechanism: Any, analysis: Analysis | None, has_none: bool, 
 
 def _expand(mechanism: Any, events: Sequence[ExpandsToEvents] | None, analysis: Analysis | None) -> Prepared:
     found = () if events is None else expand_events(events, mechanism)
-    scene = with_sticking_joints(mechanism, found)
-    found = (*found, *scene.events)
-    phases = phases_of(scene.mechanism, found, analysis, scene.joints)
-    smooth, held, kinks = with_held_forces(scene.mechanism, SIDES * len(scene.joints))
+    directed, found, phases = events_and_phases(mechanism, found, analysis)
+    smooth, held, kinks = with_held_forces(directed, SIDES * len(phases.sticking))
     return ((*found, *kinks), phases.with_kinks(smooth, held, len(kinks))) if held else (found, phases)
 
 

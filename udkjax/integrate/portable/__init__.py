@@ -2,17 +2,20 @@
 
 `portable_engine` returns it. Its contents:
 
-format       1
+format       2
 bodies       names; a state is q, which has x, y (m) and angle (rad) of each body in turn, and v, their rates
 parameters   a list of {name, unit, value}: numbers of the scene that may change, in the order in which they are given
-numbers      base64 of float64: all numbers of the scene (`count` of them), the times (s) where its motion is not smooth (`knots`
-             of them), the numbers of the `conditions` of events and, if requested, the `drawn_points`
-events       null without events, else {names; directions in which zeros count, 0 for either; by_velocity: masks; stops: whether
-             each ends the run; restitution of an impact, else null; ends_at_rest: whether its rest ends the run; slowest: rate
-             of the scene (1/s); most: largest number of events; head: number of entries of a crossing before the sides of
-             conditions; tolerances of integrate/events, by name}
-held         engines of the same mechanism with the contact of one event at rest, by the index of that event; without "close"
-forces_watched  1 for an engine in `held`, whose run also ends where the contact would have to pull; else 0
+numbers      base64 of float64: all numbers of the mechanism of all phases (`count` of them), the times (s) where its motion is
+             not smooth (`knots` of them), numbers of events (`of_events`: how many of conditions, of actions, and of joints
+             that events add) and, if requested, the `drawn_points`
+events       null without events and joints with set-valued friction, else {names: of all that may be listed; kept: the parts of
+             the module "instants" that a run keeps between two instants; starts: their values at the start, where they are not
+             zero; watched: the conditions and forces that end a stretch of motion, directions: in which zeros count; zeros:
+             bounds below which conditions count as zero, relative to their scales; zero: the same for forces; slowest: rate of
+             the scene (1/s); most: largest number of events; head: number of entries of a crossing before the sides of
+             conditions; switches: [place in `numbers`, index in the phase]; joints: places of the numbers of joints that events
+             add, and of sides; sticking: by joint [index in the phase, index in `joints`] of two numbers, one of which is one
+             while it sticks; no_event, results and words: codes of the instants, and why runs end}
 thresholds   thresholds of pivots, the inputs of a run after the numbers; closing uses those in `closing`
 closing      {thresholds, settings, tol and rounding: what counts as closed (equations/rows/position_closure.py)}
 guess        {q, v}: places in `numbers` of the initial guess
@@ -24,6 +27,7 @@ settings     settings of a run, by name, in order; `smallest` and `omega` follow
 smallest     smallest step, in units of rounding of the end time
 drift_tol    violation of Psi, in units of the rows' scales, beyond which a run has failed
 info         names of the first numbers of a run's result "info", which are followed by its last q and v
+shared       null, or the redundant rows that share the loads of joints with friction: the engine has code for these alone
 sampled      places in `numbers` of sampled quantities; `samples`: base64 of float64, a row for each interval between breaks
 masses       for each body the places in `numbers` of its mass and inertia
 efforts      a list of {driver, unit, row of Psi, place of that row in x0}
@@ -31,8 +35,8 @@ friction     whether there is friction, whose power the module "evaluate" comput
 forces       how to compute the forces of joints if no row is redundant
 pulls        for each body the places in `numbers` of a spring that pulls it: point x, y, target x, y, stiffness, damping; or []
 why          the reason why there is no "run"; else empty
-modules      run, states (conditions of events), close, evaluate, mark: {code: base64 of deflated WebAssembly, data_end, fields or
-             places and size, settings, inputs, results}
+modules      run, close, evaluate, mark; with events also states (conditions of events), project (velocities) and instants
+             (instants.py): {code: base64 of deflated WebAssembly, data_end, fields or places and size, settings, inputs, results}
 
 udkjax/show/player/engine.js runs it: `loadEngine(data)` returns an object with `close(parameters, guess)` and
 `run(parameters, state, times)`; their results are described in that file.
@@ -40,6 +44,6 @@ udkjax/show/player/engine.js runs it: `loadEngine(data)` returns an object with 
 
 from udkjax.integrate.portable.engine import PortableEngine, drawn_points, portable_engine
 from udkjax.integrate.portable.parameters import scalar_parameters
-from udkjax.integrate.portable.portable_events import unknown_friction
+from udkjax.integrate.portable.portable_events import names_of_run
 
-__all__ = ["PortableEngine", "drawn_points", "portable_engine", "scalar_parameters", "unknown_friction"]
+__all__ = ["PortableEngine", "drawn_points", "names_of_run", "portable_engine", "scalar_parameters"]

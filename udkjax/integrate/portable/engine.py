@@ -18,7 +18,7 @@ from udkjax.integrate.compiled_mechanism import compile_concrete
 from udkjax.integrate.events.law.event import ExpandsToEvents
 from udkjax.integrate.native_engine import packed
 from udkjax.integrate.portable.parameters import NumberProgram, guess_of, places_of_numbers, scalar_parameters
-from udkjax.integrate.portable.portable_events import PortableEvents, unknown_friction
+from udkjax.integrate.portable.portable_events import PortableEvents
 from udkjax.integrate.portable.pull import PREFIX, with_pulls
 from udkjax.integrate.prepare import AUTO, DRIFT_PROJECTED, Choices, prepare_run
 from udkjax.integrate.problem import Problem
@@ -26,15 +26,15 @@ from udkjax.integrate.projection import Projection
 from udkjax.native.module.steps import SMALLEST_STEP
 from udkjax.native.operations import MarkRows, Operation
 from udkjax.native.position_operations import Close
-from udkjax.native.run.state_functions import Evaluation
 from udkjax.native.runs import RunStates
-from udkjax.native.wasm import compile_wasm, wasm_module
+from udkjax.native.wasm import evaluation_module, hosted_module, wasm_module
 from udkjax.positions.assembling.assembly import State
 from udkjax.scene.arguments import checked
 from udkjax.scene.elements.bodies import GROUND
 from udkjax.scene.elements.friction import Friction
 from udkjax.scene.mechanism import Mechanism
 
+FORMAT = 2  # of the data, which engine.js reads
 STEPS_OF_A_PAGE = 20_000  # largest number of steps of a run in a page: with more the page would not respond for seconds
 
 
@@ -80,79 +80,67 @@ def portable_engine(
 
     Raises:
         SceneError: a parameter is unknown.
-        ArgumentError: an event changes the constraints.
         UnsupportedError: the scene, the condition of an event, or the dependence of numbers on a parameter has an operation
             without a machine instruction.
     """
     values = scalar_parameters(mechanism, parameters)
-    watched = PortableEvents(events, mechanism)
-    engine = _engine(mechanism, values, rtol, atol, pull, runs, watched, drawn)
-    if runs and not engine.data["why"]:
-        for event in watched.holding:
-            held = _engine(mechanism, values, rtol, atol, pull, runs, watched, False, event).data
-            if not held["why"]:
-                engine.data["held"][event] = held
-    return engine
-
-
-def _engine(
-    mechanism: Mechanism,
-    values: dict[str, float],
-    rtol: float,
-    atol: float,
-    pull: bool,
-    runs: bool,
-    watched: PortableEvents,
-    drawn: bool,
-    held: int | None = None,
-) -> PortableEngine:
-    """Compile the engine of a mechanism, with the contact of event `held` at rest unless None."""
-
-    def with_contact(given: Mechanism) -> Mechanism:
-        return given if held is None else watched.with_contact(given, held)
-
-    def dress(given: Mechanism) -> Mechanism:
-        return with_pulls(with_contact(given)) if pull else with_contact(given).without_origin
-
-    dressed, analysis = dress(mechanism), analyse(with_contact(mechanism))
-    if _may_move_by_redundancy(with_contact(mechanism), analysis):
+    with_own = with_pulls if pull else lambda given: given.without_origin
+    analysis = analyse(mechanism)
+    if _may_move_by_redundancy(mechanism, analysis):
         analysis = replace(analysis, redundant_rows=None)  # other numbers make other rows redundant: the page determines them
-    numbers = NumberProgram(
-        mechanism, values, dress, lambda given: [*watched.numbers(given), *(x for _, x in drawn_points(given) if drawn)]
-    )
+    watched = PortableEvents(events, with_own(mechanism), analysis)
+    scene, analysis = watched.mechanism(with_own(mechanism)), watched.analysis
+
+    def further(given: Mechanism) -> list[Any]:
+        drawing = [x for _, x in drawn_points(given)] if drawn else []
+        return [*(x for numbers in watched.numbers(with_own(given)) for x in numbers), *drawing]
+
+    numbers = NumberProgram(mechanism, values, lambda given: watched.mechanism(with_own(given)), further)
     data: JsonObject = {
-        "format": 1,
+        "format": FORMAT,
         "bodies": list(mechanism.body_names),
         "parameters": [{"name": name, "unit": mechanism.unit_of(name), "value": x} for name, x in values.items()],
         "numbers": floats(numbers.base),
         "count": numbers.count,
         "knots": numbers.knots,
-        "conditions": sum(np.size(x) for x in watched.numbers(mechanism)),
-        "events": watched.data(analysis),
-        "forces_watched": int(held is not None),
-        "held": {},
-        "marks": len(analysis.scales.rows) if analysis.redundant_rows is None else 0,
+        "of_events": [sum(np.size(x) for x in found) for found in watched.numbers(with_own(mechanism))],
+        "events": None,
         "sampled": [],
         "samples": "",
         "thresholds": [0.0, 0.0],
         "rows": np.asarray(analysis.scales.rows).tolist(),
         "scales": {name: float(getattr(analysis.scales, name)) for name in ("length", "rate", "mass")},
     }
-    data |= _places(dressed, pull)
-    problem = _problem(dressed, analysis, rtol, atol)
-    data["why"] = problem.compiled.plan.why_not_native or unknown_friction(mechanism)
-    if not data["why"] and problem.compiled.plan.shares_by_marks:  # a page has no code for the rows that marks tell
-        data["why"] = "friction depends on the loads of joints, and rows that may be redundant share these"
-    data["closing"] = _closing(analysis)
-    modules = {"close": _close(dressed)} if held is None else {}
+    problem = _problem(scene, analysis, rtol, atol)
+    operation, of_rows = _operation_of_rows(problem, watched)
+    data |= _places(scene, pull) | of_rows | {"closing": _closing(analysis)}
+    modules = {"close": _close(scene)}
     if data["marks"]:
-        modules["mark"] = _operation(MarkRows(scene_programs(dressed).with_all_rows))
-    if runs and not data["why"]:
-        modules |= _run(problem, data, watched, () if held is None else (watched.row(analysis, held),))
+        modules["mark"] = _operation(MarkRows(scene_programs(scene).with_all_rows))
+    if runs and operation is not None:
+        modules |= _run(operation, problem, data, watched, scene)
         if data["sampled"] and any(0 <= k - numbers.count < numbers.knots for k in numbers.changing):
             raise ValueError("parameters move breakpoints of a scene that has samples: leave out those of its motion laws")
-    modules["evaluate"] = _evaluation(dressed, analysis, numbers, data)
-    return PortableEngine(data | {"modules": modules}, numbers, dressed)
+    code = scene_programs(scene, analysis.redundant_rows) if operation is None else operation.code
+    modules["evaluate"] = _evaluation(mechanism, scene, code, numbers, data)
+    return PortableEngine(data | {"modules": modules}, numbers, scene)
+
+
+def _operation_of_rows(problem: Problem, events: PortableEvents) -> tuple[RunStates | None, JsonObject]:
+    """Return the operation of runs, None if a page has none, with `marks`, `shared`, and the reason `why` not."""
+    operation, why = problem.compiled.plan.operation, problem.compiled.plan.why_not_native
+    found: JsonObject = {"marks": 0, "shared": None, "why": why}
+    if why or operation is None:
+        return None, found
+    code = operation.code
+    found["marks"] = code.row_count if code.marks_rows else 0
+    if not code.shares_by_marks:
+        return operation, found
+    if events.phases.switches.names:  # each phase has redundant rows of its own
+        return None, found | {"why": "friction depends on the loads of joints, and rows that may be redundant share these"}
+    numbers = dict(zip(Operation.input_names, packed(problem), strict=False))["numbers"]
+    found["shared"] = np.flatnonzero(numbers[0, code.marks] < 0).tolist()
+    return replace(operation, code=code.with_shared_rows(tuple(found["shared"]))), found
 
 
 def drawn_points(mechanism: Mechanism) -> list[tuple[str, Any]]:
@@ -203,10 +191,9 @@ def _problem(mechanism: Mechanism, analysis: Analysis, rtol: float, atol: float)
     return replace(problem, smallest=np.asarray(0.0), rate=np.asarray(1.0))
 
 
-def _run(problem: Problem, data: JsonObject, events: PortableEvents, rows: tuple[int, ...]) -> JsonObject:
-    """Return the module of runs; its inputs go into the data."""
-    operation, inputs = problem.compiled.plan.operation, packed(problem)
-    assert operation is not None  # checked by the caller
+def _run(operation: RunStates, problem: Problem, data: JsonObject, events: PortableEvents, scene: Mechanism) -> JsonObject:
+    """Return the modules of runs by an operation; their inputs go into the data."""
+    inputs = packed(problem)
     inputs_by_name = dict(zip(Operation.input_names, inputs, strict=False))
     data |= {
         "thresholds": inputs_by_name["numbers"][0, -2:].tolist(),
@@ -217,9 +204,18 @@ def _run(problem: Problem, data: JsonObject, events: PortableEvents, rows: tuple
         "sampled": list(operation.sampled),
         "samples": floats(inputs[len(Operation.input_names)][0]) if operation.sampled else "",
     }
-    modules = {"run": _operation(events.watched_by(operation, rows))}
-    if data["events"] is not None:
-        modules["states"] = _operation(events.states_of(operation))
+    if data["shared"] is not None and "most_rank" in data["settings"]:
+        data["settings"]["most_rank"] -= len(data["shared"])
+    modules = {"run": _operation(events.watched_by(operation))}
+    if events.events:
+        instants = events.instants(operation)
+        data["events"] = events.data(scene, instants, data["settings"]["atol"])
+        for name, at_states in (("states", events.states_of(operation)), ("project", events.projection_of(operation))):
+            (count,) = at_states.outputs((), 2)[0]
+            modules[name] = _operation(at_states) | {"count": count}
+        found = hosted_module(instants.functions, instants.inputs, instants.imports)
+        places = {name: [place, int(np.prod(shape))] for name, (place, shape) in found.places.items()}
+        modules["instants"] = _module(found.linked.code, found.linked.data_end, places=places, size=found.size)
     return modules
 
 
@@ -233,17 +229,18 @@ def _closing(analysis: Analysis) -> JsonObject:
     return {"thresholds": [tol**2, 0.0], "settings": [length, tol], "tol": CLOSURE.tol, "rounding": CLOSURE.rounding}
 
 
-def _evaluation(mechanism: Mechanism, analysis: Analysis, numbers: NumberProgram, data: JsonObject) -> JsonObject:
-    """Return the module of evaluations; the list of its efforts goes into the data."""
-    code = scene_programs(mechanism, analysis.redundant_rows)
-    evaluation = Evaluation(code, [numbers.function()])
+def _evaluation(
+    given: Mechanism, mechanism: Mechanism, code: RunPrograms, numbers: NumberProgram, data: JsonObject
+) -> JsonObject:
+    """Return the module of evaluations of the mechanism of all phases; the list of its efforts goes into the data."""
+    linked, evaluation = evaluation_module(code, [numbers.function()])
     data["efforts"] = [
         {"driver": name, "unit": driver.effort_unit, **places}
         for (name, driver), places in zip(mechanism.drivers.items(), _driver_places(mechanism, code), strict=True)
     ]
-    data["forces"] = [] if data["why"] else joint_forces(mechanism, code)
+    shares = data["why"] or data["shared"]  # redundant rows share forces, which are not unique
+    data["forces"] = [] if shares else [x for x in joint_forces(mechanism, code) if x["constraint"] in given.constraints]
     data["friction"] = any(isinstance(force, Friction) for force in mechanism.forces.values())
-    linked = compile_wasm(evaluation.text(), ("numbers", *evaluation.exports))
     return _module(linked.code, linked.data_end, places=evaluation.places, size=evaluation.size)
 
 

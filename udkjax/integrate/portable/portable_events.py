@@ -1,129 +1,156 @@
 """Events of a portable engine: their data for a page, and the operations that run to the next event and evaluate states."""
 
 from collections.abc import Sequence
+from functools import cached_property
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from udkjax.equations.rows.analysis import Analysis
-from udkjax.integrate.events.instant import impacts as law
-from udkjax.integrate.events.law.crossings import ZERO, ZERO_RATE, ZERO_RATE_2
+from udkjax.complementarity.stick_or_slip import SIDES
+from udkjax.equations.rows.analysis import Analysis, analyse
+from udkjax.equations.terms import switches as switching
+from udkjax.integrate.events.instant.listing import names_of_events
+from udkjax.integrate.events.law.actions import numbers_of_actions
+from udkjax.integrate.events.law.crossings import NO_EVENT, ZERO, zero_of
 from udkjax.integrate.events.law.event import Event, ExpandsToEvents, expand_events
-from udkjax.integrate.events.law.phases import HeldContact, Switches
+from udkjax.integrate.events.law.event_plan import EventPlan, event_plan
+from udkjax.integrate.events.law.kinks import places_of_sides
+from udkjax.integrate.events.law.phases import Phases, events_and_phases
+from udkjax.integrate.events.run.added_joints import added_joints, joint_numbers, places_of_joints
 from udkjax.integrate.events.run.condition_program import condition_numbers, watched_conditions, with_forces
+from udkjax.integrate.events.run.phase_code import ValuesLayout
+from udkjax.integrate.portable.instants import CHANGED, LAST, Instants
+from udkjax.integrate.solution import Result
 from udkjax.native.language.program import UnsupportedError
-from udkjax.native.operations import EvaluateEvents
+from udkjax.native.operations import EvaluateEvents, StateOperation
 from udkjax.native.runs import RunStates
 from udkjax.native.watching.conditions import Conditions
-from udkjax.requirements import ArgumentError
-from udkjax.scene.elements.friction import Friction
 from udkjax.scene.mechanism import Mechanism
-from udkjax.wording import join_names, quote
 
-CONTACT = "{}.contact"  # name of the joint that holds the contact of an event
 MOST_EVENTS = 1000  # largest number in a run of a page; nobody would look at more
-TOLERANCES = {
-    "zero": ZERO,
-    "zero_rate": ZERO_RATE,
-    "zero_rate_2": ZERO_RATE_2,
-    "closed": law.CLOSED,
-    "still": law.STILL,
-    "rest": law.REST,
-    "blocked": law.BLOCKED,
-    "coupled": law.COUPLED,
+# Why a run ends at an event; those that are not here have an event's name on the page, or go on.
+WORDS = {
+    Result.beyond_contact: "it begins beyond a contact",
+    Result.event_impossible: "the constraints allow no impulse, or no friction obeys its law",
+    Result.painleve_paradox: "no forces of the contacts obey the law of friction (Painleve's paradox)",
 }
 
 
-def unknown_friction(mechanism: Mechanism, events: Sequence[Event] = ()) -> str:
-    """Return which friction a page cannot compute, and the cure; empty if it can compute all.
+NAMED = Result.successful, Result.event_stop, Result.at_rest, Result.undefined_condition
+
+
+def names_of_run(mechanism: Mechanism, events: Sequence[Event]) -> tuple[str, ...]:
+    """Return the names of all events that a run may list.
 
     Args:
         mechanism: the scene.
         events: the events of its runs, expanded.
-
-    Returns:
-        The sentence of a refusal.
     """
-    joints = [force.joint for force in mechanism.forces.values() if isinstance(force, Friction) and force.sticks]
-    contacts = [event.name for event in events if event.action.friction is not None]
-    if joints:
-        which, cure = f"joints that stick ({join_names(list(map(quote, joints)))})", 'give their friction law="smooth"'
-    elif contacts:
-        which, cure = f"friction of contacts ({join_names(list(map(quote, contacts)))})", "leave out their coefficients"
-    else:
-        return ""
-    return f"a page cannot compute {which} yet: {cure}, or leave out `live` to play the run as it is"
+    return names_of_events(*events_and_phases(mechanism, events, analyse(mechanism))[1:])
 
 
 class PortableEvents:
-    """The events, if any, of the runs of a portable engine.
+    """The events of the runs of a portable engine, those of joints with set-valued friction among them, and their phases.
+
+    Args:
+        events: the events, as for `simulate`.
+        scene: the mechanism of all runs, with the springs of a page.
+        analysis: its analysis.
 
     Raises:
-        ArgumentError: an event changes the constraints.
         UnsupportedError: a condition has an operation without a machine instruction.
     """
 
-    def __init__(self, events: Sequence[ExpandsToEvents], mechanism: Mechanism):
-        self._given = tuple(events)
-        self._events = expand_events(events, mechanism) if events else ()
-        if refused := unknown_friction(mechanism, self._events):
-            raise ArgumentError(f"live: {refused}")
-        for event in self._events:
-            if not event.action.on_page:
-                kind, cure = type(event.action).__name__, "a page knows Log, Stop and Impact; leave out live"
-                raise ArgumentError(f"live: the jump of event {quote(event.name)} ({kind}) cannot run in a page yet: {cure}")
-        self._conditions = watched_conditions(self._events, mechanism) if events else None
-        if self._conditions is None and events:
+    def __init__(self, events: Sequence[ExpandsToEvents], scene: Mechanism, analysis: Analysis):
+        self._given, self._of_scene = tuple(events), analysis
+        self.events, self.phases = self._prepared(scene)
+        conditions = watched_conditions(self.events, self.phases.mechanisms[0]) if self.events else None
+        if conditions is None and self.events:
             raise UnsupportedError("the condition of an event")
+        self._conditions = conditions
+        self.analysis: Any = self.phases.analyses[-1]
 
-    @property
-    def holding(self) -> list[int]:
-        """The indices of events whose contacts are held at rest."""
-        return [k for k, e in enumerate(self._events) if e.action.rest == "hold"]
+    def _prepared(self, scene: Mechanism) -> tuple[tuple[Event, ...], Phases]:
+        """Return all events, and the phases that they lead to."""
+        given = expand_events(self._given, scene) if self._given else ()
+        _, events, phases = events_and_phases(scene, given, self._of_scene)
+        return events, phases
 
-    def with_contact(self, mechanism: Mechanism, event: int) -> Mechanism:
-        """Return the mechanism with the contact of an event at rest, as a joint."""
-        held = expand_events(self._given, mechanism)[event]
-        joints = {**mechanism.joints, CONTACT.format(held.name): HeldContact.of(held, mechanism)}
-        return Mechanism(mechanism.bodies, joints, mechanism.drivers, mechanism.forces, mechanism.gravity, mechanism.name)
+    def mechanism(self, scene: Mechanism) -> Mechanism:
+        """Return the mechanism of all phases, in the phase in which a run of a scene begins; its numbers may be traced."""
+        _, phases = self._prepared(scene)
+        added = *phases.first_added(), jnp.zeros(SIDES * len(phases.sticking))
+        return phases.mechanism(len(phases.mechanisms) - 1, jnp.asarray(self.plan.first), added)
 
-    def row(self, analysis: Analysis, event: int) -> int:
-        """Return the row of Psi of the contact of an event."""
-        return [name for name, _ in analysis.row_names].index(CONTACT.format(self._events[event].name))
+    def numbers(self, scene: Mechanism) -> list[list[Array]]:
+        """Return the numbers of the conditions, of the actions, and of the joints that events add, which may be traced."""
+        if not self.events:
+            return [[], [], []]
+        events, phases = self._prepared(scene)
+        actions = numbers_of_actions([e.action for e in events], jnp)
+        return [condition_numbers(events), [actions], joint_numbers(phases)]
 
-    def data(self, analysis: Analysis) -> dict[str, Any] | None:
-        """Return the events as data of a page; None without events."""
-        if not self._events:
-            return None
-        assert self._conditions is not None  # since there are events
-        return {
-            "names": [event.name for event in self._events],
-            "directions": [event.direction for event in self._events],
-            "by_velocity": list(self._conditions.by_velocity),
-            "stops": [event.action.stops for event in self._events],
-            "restitution": [float(event.action.rebound) if event.action.is_impact else None for event in self._events],
-            "ends_at_rest": [event.action.rest == "stop" for event in self._events],
-            "slowest": float(analysis.scales.rate),
-            "most": MOST_EVENTS,
-            "head": Conditions.head,
-            "tolerances": TOLERANCES,
-        }
+    @cached_property
+    def plan(self) -> EventPlan:
+        """The phases and events, with room for the events of one instant: all, each as it happens, lets go and rests."""
+        most = 2 + 3 * len(self.events)
+        by_velocity = () if self._conditions is None else self._conditions.by_velocity
+        return event_plan(self.phases, self.events, np.iinfo(np.int32).max, most, by_velocity)
 
-    def numbers(self, mechanism: Mechanism) -> Sequence[Array | np.ndarray]:
-        """Return the numbers of the conditions, which may depend on the numbers of the mechanism."""
-        return condition_numbers(expand_events(self._given, mechanism)) if self._given else ()
+    def _watched(self, operation: RunStates) -> Conditions:
+        assert self._conditions is not None  # there are events
+        return with_forces(self._conditions, self.events, self.phases.switches, operation.code.row_count)
 
-    def watched_by(self, operation: RunStates, rows: tuple[int, ...] = ()) -> RunStates:
-        """Return the run that ends where a condition, or the force of a contact in one of the rows of Psi, crosses zero."""
-        if self._conditions is None:
-            return operation
-        E, m = len(self._events), operation.code.row_count
-        held = Switches(rows=(*rows, *[-1] * (E - len(rows))), joint_rows=((),) * E)
-        return operation.watching(with_forces(self._conditions, self._events, held, m))
+    def watched_by(self, operation: RunStates) -> RunStates:
+        """Return the run that ends where a condition or a force crosses zero."""
+        return operation.watching(self._watched(operation)) if self.events else operation
 
     def states_of(self, run: RunStates) -> EvaluateEvents:
-        """Return the operation that evaluates conditions, their rates and slopes, and directions of impulses at states."""
-        assert self._conditions is not None  # since there are events
-        impacts = tuple(k for k, event in enumerate(self._events) if event.action.is_impact)
-        return run.accelerations.of_events(self._conditions, impacts)
+        """Return the operation that evaluates conditions, their rates and slopes, directions of impulses and forces at states."""
+        directed = tuple(int(k) for k in (*np.flatnonzero(self.plan.impacts), *self.plan.forwards))
+        return run.accelerations.of_events(self._watched(run), directed)
+
+    def projection_of(self, run: RunStates) -> StateOperation:
+        """Return the operation that projects states whose velocities an event has changed."""
+        return run.accelerations.jump
+
+    def instants(self, run: RunStates) -> Instants:
+        """Return the code of all that happens at an instant."""
+        values = ValuesLayout(self.states_of(run), self.phases.switches)
+        n = self.phases.mechanisms[0].coordinate_count
+        return Instants(self.plan, added_joints(self.phases), values, n, (self.events, self.phases))
+
+    def data(self, dressed: Mechanism, instants: Instants, atol: float) -> dict[str, Any]:
+        """Return the events as data of a page.
+
+        Args:
+            dressed: the mechanism of all phases.
+            instants: the code of all that happens at an instant.
+            atol: the absolute tolerance of runs, in units of the scene.
+        """
+        plan, phases, switches = self.plan, self.phases, self.phases.switches
+        joints = places_of_joints(dressed, [name for _, name in phases.added_by])
+        sides = places_of_sides(dressed, phases.sided) if phases.sided else ()
+        places = [place for of_joint in (*joints, sides) for place in of_joint]
+        locks = zip(phases.sticking, plan.locks, strict=True) if phases.sticking else ()
+        watched = [*range(plan.count), *(plan.count + k for k, row in enumerate(switches.rows) if row >= 0)]
+        return {
+            "names": names_of_events(self.events, phases),
+            "kept": [*(x for x in CHANGED if x not in ("t", "q", "v")), *(f"last_{x}" for x in LAST)],
+            "watched": watched,
+            "directions": plan.both_directions[watched].tolist(),
+            "zeros": zero_of(plan.slides, np.array([atol]), np).tolist(),
+            "zero": ZERO,
+            "slowest": float(self.analysis.scales.rate),
+            "most": MOST_EVENTS,
+            "head": Conditions.head,
+            "switches": switching.places_of_switches(dressed, switches.names) if switches.names else [],
+            "joints": places,
+            "sticking": {x.name: [int(lock), len(places) - plan.side_count + x.first + 1] for x, lock in locks},
+            "starts": instants.starts,
+            "no_event": NO_EVENT,
+            "results": {x.name: int(x) for x in NAMED},
+            "words": {int(result): words for result, words in WORDS.items()},
+        }

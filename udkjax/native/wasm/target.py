@@ -4,11 +4,15 @@ LLVM's text is the same: the call record of `run` has fields of 8 bytes, of whic
 rounded separately. The functions of memory management (malloc, free) are imports.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
+from udkjax.equations.programs.run_programs import RunPrograms
 from udkjax.native.code import code_cache, machine
+from udkjax.native.language.ir import Function
 from udkjax.native.module.memory import Memory
 from udkjax.native.operations import Operation
+from udkjax.native.run.state_functions import Evaluation
 from udkjax.native.wasm.object_code import LinkedModule, link
 
 TRIPLE = "wasm32-unknown-unknown"
@@ -40,6 +44,16 @@ def wasm_module(operation: Operation) -> WasmModule:
     module.is_interruptible = False  # pyright: ignore[reportAttributeAccessIssue]
     module.written_text = module.text()
     return WasmModule(compile_wasm(module.written_text, ("run",)), module)
+
+
+def evaluation_module(code: RunPrograms, further: Sequence[Function]) -> tuple[LinkedModule, Evaluation]:
+    """Compile the evaluation of a scene at single states, with the function `numbers` among further ones.
+
+    Returns:
+        The module, and the evaluation, which describes its functions and its memory.
+    """
+    evaluation = Evaluation(code, further)
+    return compile_wasm(evaluation.text(), ("numbers", *evaluation.exports)), evaluation
 
 
 def compile_wasm(text: str, exports: tuple[str, ...]) -> LinkedModule:

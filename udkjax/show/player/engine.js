@@ -6,7 +6,7 @@
 //   engine.close(parameters, guess)            -> {t, q, v, violation, rate, rank, closed}
 //   engine.mark(parameters, state)             -> for each row of Psi 1 if it is independent near a state, else 0; null if all are
 //   engine.run(parameters, state, times, pull, limit) -> {ts, q, v, violation, count, done, words, t, steps, tried, limited, events,
-//                                                 held, last}
+//                                                 modes, last}
 //   engine.measure(parameters, run, efforts, forces, accelerations) -> {kinetic, potential, efforts: {driver: values}, friction, forces, a}
 //
 // Parameters are an array of numbers, or null for those of the scene. Arrays are Float64Array; q has x, y (m), angle (rad) of each
@@ -37,6 +37,7 @@ class Instance {
     found.start = Math.ceil((module.data_end + STACK) / LINE) * LINE;
     found.memory = new WebAssembly.Memory({initial: Math.ceil(found.start / PAGE) + 1});
     const env = {__linear_memory: found.memory, malloc: size => found.reserve(Number(size)), free: () => {}};
+    for (const name of ["look", "project"]) env[name] = () => found.imports[name]();  // set by each run
     env.__stack_pointer = new WebAssembly.Global({value: "i32", mutable: true}, found.start);
     const {instance} = await WebAssembly.instantiate(await inflate(module.code), {env});
     found.exports = instance.exports;
@@ -98,10 +99,23 @@ class Engine {
     return module.view(to, this.base.length).slice();
   }
 
-  conditionNumbers(numbers) {
-    const {count, knots, conditions} = this.data;
-    return numbers.subarray(count + knots, count + knots + conditions);
+  /** The numbers of conditions, of actions, and of joints that events add. */
+  numbersOfEvents(numbers) {
+    let place = this.data.count + this.data.knots;
+    return this.data.of_events.map(size => numbers.subarray(place, place += size));
   }
+
+  /** Numbers in another mode {phase, joints}: the constraints that hold, and the numbers of joints that events have added. */
+  inMode(numbers, mode) {
+    if (!mode) return numbers;
+    const found = numbers.slice(), {switches, joints} = this.data.events;
+    joints.forEach((place, k) => { if (place >= 0) found[place] = mode.joints[k]; });
+    switches.forEach(([place, k]) => { found[place] = mode.phase[k]; });
+    return found;
+  }
+
+  /** The numbers of joints that events have added. */
+  jointsIn(numbers) { return Float64Array.from(this.data.events.joints, place => (place < 0 ? 0 : numbers[place])); }
 
   /** All numbers of the scene, with the spring that pulls a body. */
   pulled(parameters, pull) {
@@ -117,7 +131,7 @@ class Engine {
   dressed(numbers, thresholds, t, marks = null) {
     const {count} = this.data, found = new Float64Array(count + (marks?.length ?? 0) + 2);
     found.set(numbers.subarray(0, count));
-    if (marks) found.set(marks, count);
+    if (marks) found.set(this.data.shared ? this.data.rows.map(unit => this.data.scales.length / unit) : marks, count);
     found.set(thresholds, found.length - 2);
     const passed = this.breaks(numbers).filter(b => b <= t).length;
     this.data.sampled.forEach((place, k) => { found[place] = this.samples[passed * this.row + k]; });
@@ -161,6 +175,12 @@ class Engine {
     return this.instances.mark.run(inputs, {marks: data.marks}, {times: 2, knots: 0}).marks;
   }
 
+  /** Why the friction of joints cannot be computed: redundant rows share their loads, and the engine has code for some of them. */
+  otherShares(numbers, state) {
+    const {shared} = this.data, marks = shared && this.markRows(numbers, state);
+    return marks && marks.some((mark, k) => (mark === 0) !== shared.includes(k)) ? "with these numbers other constraints are redundant, and share loads that friction depends on" : "";
+  }
+
   /** Integrate the motion from a closed state {q, v} at times[0]; missing `marks` of the state are computed.
    *
    *  `pull` is a spring {body, point, target, stiffness, damping} that pulls a body (its index): point in its frame and target in
@@ -168,17 +188,20 @@ class Engine {
    *  `limit` is the largest number of attempted steps, by default 20,000; a run that reaches it can continue from its `last` state.
    *  Returns the times ts, q and v, and the `violation` of Psi (in units of the scene), of which the first `count` are valid;
    *  `done`, and if it is false the reason in `words`; the number of `steps`; the `last` state; its `marks`; and `events`, a list of
-   *  {t, index, q, v}, where the number of events is added to the index of a contact that lets go, and twice this number if it comes
-   *  to rest. If an event stops the motion, `stop` is the reason, and the last time is that of the event. `held` is, at each time,
-   *  the index of the event whose contact is at rest plus one, or 0.
+   *  {t, index, q, v}, where `index` is that of a name in `data.events.names`. If an event stops the motion, `stop` is the reason, and
+   *  the last time is that of the event. `modes` has, for each time, which constraints hold; parts of a motion in one mode share it.
    */
   run(parameters, state, times, pull = null, limit = this.data.settings.max_steps) {
     const {data} = this, T = times.length;
     if (data.why) throw new Error(data.why);
     const end = Math.max(Math.abs(times[0]), Math.abs(times[T - 1])), smallest = data.smallest * EPS * end;
     const omega = Math.max(data.scales.rate, largest(state.v, this.unit), 1 / (times[T - 1] - times[0]));
-    if (data.events) return runWithEvents(this, engine => engine.pulled(parameters, pull), {smallest, omega}, state, Float64Array.from(times), !pull, limit);
-    return {...this.piece(this.pulled(parameters, pull), {...data.settings, smallest, omega}, state, Float64Array.from(times), limit), events: []};
+    const numbers = this.pulled(parameters, pull), settings = {...data.settings, smallest, omega};
+    const others = this.otherShares(numbers, {t: times[0], ...state});
+    if (others) return {ts: Float64Array.from(times), q: new Float64Array(T * this.size), v: new Float64Array(T * this.size), violation: new Float64Array(T),
+      count: 0, done: false, words: others, t: times[0], steps: 0, tried: 0, limited: false, last: {t: times[0], ...state}, marks: null, events: []};
+    if (data.events) return runWithEvents(this, numbers, settings, state, Float64Array.from(times), !pull, limit);
+    return {...this.piece(numbers, settings, state, Float64Array.from(times), limit), events: []};
   }
 
   /** Integrate from a state over times, up to the first zero `crossing` of the conditions in `watch`. */
@@ -187,7 +210,7 @@ class Engine {
     const inputs = {numbers: this.dressed(numbers, data.thresholds, ts[0], marks), ts, q: state.q, v: state.v,
       settings: Object.values({...settings, max_steps: limit}), rows: data.rows, breaks, samples: this.samples, watch};
     const info = data.info.length, results = {qs: T * size, vs: T * size, violation: T, info: info + 2 * size};
-    if (data.events) results.crossing = data.events.head + data.events.names.length + data.forces_watched + 2 * size;
+    if (data.events) results.crossing = data.events.head + data.events.watched.length + 2 * size;
     const found = this.instances.run.run(inputs, results, {times: T, knots: breaks.length});
     const ended = Object.fromEntries(data.info.map((name, k) => [name, found.info[k]]));
     const status = STATUSES[ended.code], limited = status === "step_limit";
@@ -198,20 +221,12 @@ class Engine {
       steps: ended.accepted, tried: ended.tried, limited, last, marks, crossing: found.crossing};
   }
 
-  /** The conditions of events at a state: g, its first and second rates, derivatives with respect to t, q and v, and for each
-   *  impact the velocities due to a unit impulse along it. */
-  conditions(numbers, settings, state) {
-    const {data: {events, rows}, size: n, instances: {states}} = this, E = events.names.length, {t, q, v} = state;
-    const impacts = events.restitution.map((e, k) => (e === null ? -1 : k)).filter(k => k >= 0);
-    const marks = state.marks ?? this.markRows(numbers, state), total = n + 4 * E + 2 * E * n + impacts.length * n;
-    const inputs = {numbers: this.dressed(numbers, this.data.thresholds, t, marks), ts: [t, t], q, v, rows, breaks: [],
-      settings: states.module.settings.map(name => settings[name]), event_numbers: [...this.conditionNumbers(numbers), ...this.inverseMasses(numbers)]};
-    const {found} = states.run(inputs, {found: total}, {times: 2, knots: 0});
-    let place = n;
-    const take = size => found.slice(place, place += size), rowsOf = () => Array.from({length: E}, () => take(n));
-    const known = {g: take(E), rate: take(E), rate2: take(E), byT: take(E), byQ: rowsOf(), byV: rowsOf()}, directions = [];
-    for (const k of impacts) directions[k] = take(n);
-    return {...known, directions};
+  /** Evaluate a module at a state: `states`, the conditions of events, or `project`. */
+  evaluate(name, settings, numbers, {t, q, v, marks}) {
+    const instance = this.instances[name], {module} = instance, [conditions] = this.numbersOfEvents(numbers);
+    const inputs = {numbers: this.dressed(numbers, this.data.thresholds, t, marks), ts: [t, t], q, v, rows: this.data.rows, breaks: [],
+      settings: module.settings.map(name => settings[name]), event_numbers: [...conditions, ...this.inverseMasses(numbers)]};
+    return instance.run(inputs, {found: module.count}, {times: 2, knots: 0}).found;
   }
 
   /** One over the mass, or the inertia, of each coordinate. */
@@ -221,11 +236,11 @@ class Engine {
    *  friction (W), and the forces x, y (N) of the joints of `data.forces`, for all joints time by time, and accelerations `a`; these
    *  are empty if rows are redundant: forces are not unique. */
   measure(parameters, run, efforts = false, forces = false, accelerations = false) {
-    if (run.held?.subarray(0, run.count).some(k => k > 0)) return this.measureParts(parameters, run, efforts, forces);
-    const {ts, q, v, count, marks = null} = run;
+    if (run.modes) return this.measureParts(parameters, run, efforts, forces);
+    const {ts, q, v, count, mode, marks = null} = run;
     const {data, size} = this, module = this.instances.evaluate, {places} = module.module;
     const rubs = efforts && data.friction, wanted = efforts ? data.efforts.filter(({row}) => !marks || marks[row]) : [], unique = !marks || marks.every(Boolean);
-    const numbers = this.numbers(parameters), breaks = this.row ? this.breaks(numbers) : [];
+    const numbers = this.inMode(this.numbers(parameters), mode), breaks = this.row ? this.breaks(numbers) : [];
     module.begin();
     const given = module.reserve(8 * (data.count + data.marks + 2)), work = module.reserve(8 * module.module.size);
     module.view(work, module.module.size).fill(0);
@@ -255,15 +270,14 @@ class Engine {
     return found;
   }
 
-  /** `measure` for a run in which contacts come to rest: each part of the run is measured by the engine that computed it. */
-  measureParts(parameters, {ts, q, v, count, held, marks}, efforts, forces) {
-    const n = this.size, parts = [];
+  /** `measure` for a run with events: each part of the run, in one mode, by itself. */
+  measureParts(parameters, {ts, q, v, count, modes}, efforts, forces) {
+    const n = this.size, numbers = this.numbers(parameters), parts = [];
     for (let from = 0, to = 0; from < count; from = to) {
-      while (to < count && held[to] === held[from]) to++;
-      const part = {ts: ts.subarray(from, to), q: q.subarray(from * n, to * n), v: v.subarray(from * n, to * n), count: to - from, marks};
-      const engine = held[from] ? this.held[held[from] - 1] : this;
-      if (held[from]) part.marks = engine.mark(parameters, {t: ts[from], q: part.q.subarray(0, n), v: part.v.subarray(0, n)});
-      parts.push(engine.measure(parameters, part, efforts, forces));
+      while (to < count && modes[to] === modes[from]) to++;
+      const part = {ts: ts.subarray(from, to), q: q.subarray(from * n, to * n), v: v.subarray(from * n, to * n), count: to - from, mode: modes[from]};
+      part.marks = this.markRows(this.inMode(numbers, part.mode), {t: ts[from], q: part.q.subarray(0, n), v: part.v.subarray(0, n)});
+      parts.push(this.measure(parameters, part, efforts, forces));
     }
     const joined = of => Float64Array.from(parts.flatMap(part => [...of(part)]));
     return {kinetic: joined(p => p.kinetic), potential: joined(p => p.potential),
@@ -281,9 +295,8 @@ class Engine {
 
 /** The engine of a mechanism, from its data. */
 export async function loadEngine(data) {
-  if (data.format !== 1) throw new Error(`this engine reads format 1, not ${data.format}`);
+  if (data.format !== 2) throw new Error(`this engine reads format 2, not ${data.format}`);
   const loaded = Object.entries(data.modules).map(async ([name, module]) => [name, await Instance.load(module)]);
   const engine = new Engine(data, Object.fromEntries(await Promise.all(loaded)));
-  engine.held = Object.fromEntries(await Promise.all(Object.entries(data.held).map(async ([k, of]) => [k, await loadEngine(of)])));
   return engine;
 }

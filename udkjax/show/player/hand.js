@@ -34,7 +34,7 @@ export class Hand {
     }
     if (this.isBlocked) live.live.greet();  // replaces the message
     this.isBlocked = false;
-    this.state = {t, q: run.q.slice(n), v: run.v.slice(n), marks: run.marks, watch: run.last.watch, held: run.last.held};
+    this.state = {t, q: run.q.slice(n), v: run.v.slice(n), marks: run.marks, watch: run.last.watch, mode: run.last.mode};
     live.append(this.state, run.violation[1], run.events);
     return null;
   }

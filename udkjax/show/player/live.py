@@ -15,7 +15,7 @@ import numpy as np
 from udkjax.annotations import JsonObject
 from udkjax.equations.rows.analysis import analyse
 from udkjax.integrate.events.law.event import ExpandsToEvents, expand_events
-from udkjax.integrate.portable import portable_engine, unknown_friction
+from udkjax.integrate.portable import names_of_run, portable_engine
 from udkjax.native.language.program import UnsupportedError
 from udkjax.positions.assembling.assembly import close
 from udkjax.requirements import ArgumentError
@@ -57,7 +57,7 @@ def live_data(
             engines[key] = len(engines)
             data["engines"].append(_engine(mechanism, run_sliders, rtol, atol, events))
         engine = data["engines"][engines[key]]
-        drawn = engine["count"] + engine["knots"] + engine["conditions"]
+        drawn = engine["count"] + engine["knots"] + sum(engine["of_events"])
         updates = symbol_updates(mechanism, record, record["symbols"], drawn)
         start, times = _start(mechanism, solution), _times(solution)
         data["runs"].append(
@@ -70,13 +70,11 @@ def live_data(
 
 
 def _require_solvable(mechanism: Mechanism, solution: ShownMotion, events: Sequence[ExpandsToEvents]):
-    expanded = expand_events(events, mechanism) if events else ()
-    if refused := unknown_friction(mechanism, expanded):
-        raise ArgumentError(f"live: {refused}")
-    happened, names = getattr(solution, "events", None), [event.name for event in expanded]
-    if happened is not None and not events:
+    happened, own = getattr(solution, "events", None), tuple(expand_events(events, mechanism) if events else ())
+    expected, names = names_of_run(mechanism, own), [event.name for event in own]
+    if happened is not None and not events and tuple(happened.names) != expected:
         raise ArgumentError("live: the run has events, whose conditions the page needs: give `animate` the same `events`")
-    if names and (happened is None or list(happened.names[: len(names)]) != names or len(happened.names) != 3 * len(names)):
+    if names and (happened is None or tuple(happened.names) != expected):
         raise ArgumentError(f"live: the run was not simulated with the events {', '.join(names)}: give them to `simulate`, too")
     stabilization = getattr(solution, "settings", {}).get("stabilization", "Projection")
     if stabilization != "Projection":

@@ -17,8 +17,8 @@ const USUAL = 0.95;  // fraction of the instants without a force above the usual
 export class LiveRun {
   /** `live` is the page; `run` is shown; `record` is its data, and `data` its further data for a live page. */
   constructor(live, run, record, data) {
-    const {ts, q, v, measures, frame, reactions, forces, events} = run;
-    Object.assign(this, {live, run, data, player: live.player, ghost: new Run(record), first: {ts, q, v, measures, frame, reactions, forces, events}});
+    const {ts, q, v, measures, frame, reactions, forces, events, sticking} = run;
+    Object.assign(this, {live, run, data, player: live.player, ghost: new Run(record), first: {ts, q, v, measures, frame, reactions, forces, events, sticking}});
     this.times = data.times ? Float64Array.from(data.times) : ts;  // all output times, even if the first motion failed or was stopped
     this.updater = new SymbolUpdater(run, data.symbol_updates);
     Object.assign(this, {changed: false, hand: null, job: null, marks: null});
@@ -53,7 +53,8 @@ export class LiveRun {
     const {ts, q, v, measures, frame, reactions, forces, events} = this.first;
     this.drop();
     this.run.replace(ts, q, v, measures, frame, events);
-    this.run.held = null;
+    this.run.modes = null;
+    this.run.sticking = this.first.sticking;
     this.showReactions(reactions, forces);
     this.updater.update(this.engine.numbers(null));
     this.changed = false;
@@ -101,15 +102,32 @@ export class LiveRun {
     const part = {...run, marks: this.marks, ts: cut(run.ts, 1), q: cut(run.q, n), v: cut(run.v, n), violation: cut(run.violation, 1)};
     const found = this.engine.measure(this.values, part, true, Boolean(this.first.reactions));
     this.run.replace(part.ts, part.q, part.v, this.measures(part, found), 1, this.named(run.events));
-    this.run.held = run.held;
+    this.run.modes = run.modes;
+    this.run.sticking = this.stuck(part, this.run.events);
     this.showReactions(this.reactions(found.forces), found.forces);
     this.changed = true;
   }
 
+  /** The joints that stick, with the spans of time in which they do: from their events, or else from output to output. */
+  stuck({ts, modes}, events) {
+    const {sticking = {}} = this.engine.data.events ?? {};
+    return (this.first.sticking ?? []).map(joint => {
+      const [lock, side] = sticking[joint.name], sticks = mode => Boolean(mode) && (mode.phase[lock] > 0.5 || mode.joints[side] > 0.5), changes = [];
+      ts.forEach((t, k) => {
+        const now = sticks(modes[k]), before = k > 0 && sticks(modes[k - 1]);
+        if (now === before) return;
+        const name = `${joint.name} ${now ? "sticks" : "slips"}`, event = events.findLast(e => e.name === name && e.t >= ts[k - 1] && e.t <= t);
+        changes.push(event?.t ?? t);
+      });
+      if (changes.length % 2) changes.push(ts[ts.length - 1]);
+      return {...joint, spans: Array.from({length: changes.length / 2}, (_, k) => changes.slice(2 * k, 2 * k + 2))};
+    });
+  }
+
   /** Events in the form in which they are shown, {t, name}. */
   named(events) {
-    const names = this.engine.data.events?.names ?? [], nameOf = k => names[k % names.length] + ["", " lets go", " rests"][Math.floor(k / names.length)];
-    return events.map(({t, index}) => ({t, name: nameOf(index)}));
+    const names = this.engine.data.events?.names ?? [];
+    return events.map(({t, index}) => ({t, name: names[index]}));
   }
 
   /** The arrows of forces computed in the page; null with redundant constraints, since forces are not unique. */
@@ -182,23 +200,30 @@ export class LiveRun {
   /** Begin the record of a pull with the motion up to now. */
   record(state) {
     const {ts, q, v} = this.run, n = this.engine.size, count = ts.findIndex(t => t >= state.t), before = count < 0 ? ts.length : count;
-    const old = this.run.measures.find(m => m.name === "violation")?.values, {length} = this.engine.data.scales;
+    const modes = this.modesBefore(before), old = this.run.measures.find(m => m.name === "violation")?.values, {length} = this.engine.data.scales;
     this.past = {ts: [...ts.slice(0, before)], q: [...q.slice(0, before * n)], v: [...v.slice(0, before * n)],
-      violation: Array.from({length: before}, (_, k) => (old?.[k] ?? 0) / length), held: Array.from({length: before}, (_, k) => this.run.held?.[k] ?? 0)};
+      violation: Array.from({length: before}, (_, k) => (old?.[k] ?? 0) / length), modes: Array.from({length: before}, (_, k) => modes?.[k] ?? null)};
     this.happened = this.run.events.filter(({t}) => t <= state.t);
     this.marks = state.marks ??= this.engine.mark(this.values, state);
     this.append(state, state.violation, []);
   }
 
+  /** The modes of the first outputs of the motion; of a recorded motion they are computed. */
+  modesBefore(count) {
+    const {run: {modes, ts}, engine, values} = this;
+    if (modes || !engine.data.events || count < 2) return modes;
+    return engine.run(values, this.close(values), ts.subarray(0, count)).modes;
+  }
+
   /** Add a state, and the events before it, to the record, and show it. */
-  append({t, q, v, held = -1}, violation, events) {
+  append({t, q, v, mode = null}, violation, events) {
     const {past} = this;
     this.happened.push(...this.named(events));
     past.ts.push(t);
     past.q.push(...q);
     past.v.push(...v);
     past.violation.push(violation);
-    past.held.push(held + 1);
+    past.modes.push(mode);
     this.showPast();
     this.player.setEnd(Math.max(t, this.player.data.end));
     this.player.t = t;
@@ -206,7 +231,8 @@ export class LiveRun {
   }
 
   showPast() {
-    const run = Object.fromEntries(Object.entries(this.past).map(([name, x]) => [name, Float64Array.from(x)]));
+    const {modes, ...numbers} = this.past, run = Object.fromEntries(Object.entries(numbers).map(([name, x]) => [name, Float64Array.from(x)]));
+    run.modes = this.engine.data.events ? modes : null;
     this.show({...run, count: run.ts.length, events: []});
     this.run.events = this.happened;
   }
@@ -220,7 +246,7 @@ export class LiveRun {
       past.q.push(...run.q.subarray(k * n, (k + 1) * n));
       past.v.push(...run.v.subarray(k * n, (k + 1) * n));
       past.violation.push(run.violation[k]);
-      past.held.push(run.held?.[k] ?? 0);
+      past.modes.push(run.modes?.[k] ?? null);
     }
     this.happened.push(...this.named(run.events));
     this.showPast();

@@ -80,7 +80,7 @@ export class Run {
   /** The coordinates and their rates at any time between the first and the last instant. */
   state(t) { return stateAt(this, t, this.size); }
 
-  /** The joints that stick at a time; those of a motion computed in the page never do. */
+  /** The joints that stick at a time. */
   stuck(t) { return (this.sticking ?? []).filter(({spans}) => spans.some(([from, to]) => from <= t && t <= to)); }
 
   find(t) { return interval(this.ts, t); }

@@ -7,7 +7,7 @@ export class PartRun {
   /** The run of `engine` from a closed state over `times`, with the numbers `values`. */
   constructor(engine, values, state, times) {
     const T = times.length, n = engine.size;
-    const run = {ts: times.slice(), q: new Float64Array(T * n), v: new Float64Array(T * n), violation: new Float64Array(T), held: new Int16Array(T), count: 0, events: []};
+    const run = {ts: times.slice(), q: new Float64Array(T * n), v: new Float64Array(T * n), violation: new Float64Array(T), modes: engine.data.events ? Array(T).fill(null) : null, count: 0, events: []};
     Object.assign(this, {engine, values, state, run, steps: 0, tried: 0, t: times[0], goesOn: true, stands: false, done: false, stop: null, words: ""});
   }
 
@@ -29,7 +29,7 @@ export class PartRun {
     run.q.set(part.q.subarray(skip * n, (skip + count) * n), from * n);
     run.v.set(part.v.subarray(skip * n, (skip + count) * n), from * n);
     run.violation.set(part.violation.subarray(skip, skip + count), from);
-    if (part.held) run.held.set(part.held.subarray(skip, skip + count), from);
+    if (run.modes) run.modes.splice(from, count, ...part.modes.slice(skip, skip + count));
     run.count = from + count;
     run.events.push(...part.events);
     this.steps += part.steps;

@@ -107,4 +107,4 @@ export class PageEngine {
 }
 
 /** The part of an engine's data that closes positions. */
-const positionsOf = data => ({...data, modules: {close: data.modules.close, evaluate: data.modules.evaluate}, held: {}});
+const positionsOf = data => ({...data, modules: {close: data.modules.close, evaluate: data.modules.evaluate}});

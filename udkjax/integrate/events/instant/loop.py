@@ -35,16 +35,26 @@ CLOSED_FIELD, INDEX_FIELD = RECORD.index("closed"), RECORD.index("event_index")
 def run_loop(system: System, runs: MemberRuns) -> MemberRuns:
     """Run from the start to the last output time, or to an event that ends the run."""
     if system.plan.sticking:
-        runs = system.when(runs.running, partial(begin_with_friction, system), runs)
+        runs = begin(system, runs)
         runs = runs._replace(first_phase=runs.phase + False, first_sides=system.sides(None, runs.joints) + 0.0)
 
     def change(runs: MemberRuns) -> MemberRuns:
         runs = system.when(runs.running & (runs.event == NO_EVENT), system.advance, runs)
-        if system.plan.held_at_rest.sum() > 1:
-            runs = system.when(ends_hop(system, runs), partial(return_to_top, system), runs)
-        return system.when(runs.running, partial(_settle, system), runs)
+        return settle(system, runs)
 
     return system.repeat(change, runs)
+
+
+def begin(system: System, runs: MemberRuns) -> MemberRuns:
+    """Return the runs with the modes of all joints that may stick at their start."""
+    return system.when(runs.running, partial(begin_with_friction, system), runs)
+
+
+def settle(system: System, runs: MemberRuns) -> MemberRuns:
+    """Return the runs after all changes at their present times, before they advance again."""
+    if system.plan.held_at_rest.sum() > 1:
+        runs = system.when(ends_hop(system, runs), partial(return_to_top, system), runs)
+    return system.when(runs.running, partial(_settle, system), runs)
 
 
 def _settle(system: System, runs: MemberRuns, members: MemberIndices) -> MemberRuns:

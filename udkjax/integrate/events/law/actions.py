@@ -32,7 +32,6 @@ class Action(PrintsLine):
         stops: whether it ends the run.
         changes: whether it changes the motion; if not, contacts stay as they are.
         adds: whether it adds a joint, its `addition`.
-        on_page: whether the engine of live pages supports it.
         needs_joints: whether it changes joints, which a user-defined system lacks.
     """
 
@@ -40,7 +39,6 @@ class Action(PrintsLine):
     stops: ClassVar[bool] = False
     changes: ClassVar[bool] = True
     adds: ClassVar[bool] = False
-    on_page: ClassVar[bool] = False
     needs_joints: ClassVar[bool] = True
 
     @property
@@ -99,7 +97,6 @@ class Stop(Action):
 
     stops = True
     changes = False
-    on_page = True
     needs_joints = False
 
 
@@ -107,7 +104,6 @@ class Log(Action):
     """Record time and state, and go on."""
 
     changes = False
-    on_page = True
     needs_joints = False
 
 
@@ -128,7 +124,6 @@ class Impact(Action):
     at_rest: Literal["hold", "stop"] = eqx.field(static=True, default="hold")
 
     is_impact = True
-    on_page = True
     needs_joints = False
 
     @property
@@ -159,8 +154,6 @@ class RubbingImpact(Impact):
 
     coefficient: Float[Array, ""] = eqx.field(converter=number_if_any, default=0.0)
     static_coefficient: Float[Array, ""] | None = eqx.field(converter=number_if_any, default=None)
-
-    on_page = False
 
     @property
     def friction(self):

@@ -24,7 +24,7 @@ from udkjax.equations.terms import switches as switching
 from udkjax.integrate.events.law.conditions import BodyCondition, Frames, frames_of
 from udkjax.integrate.events.law.event import Event
 from udkjax.integrate.events.law.kinks import HeldElement, has_sides, sides_in
-from udkjax.integrate.events.law.sticking_joints import StickingJoint, friction_of, line_of, lock_of
+from udkjax.integrate.events.law.sticking_joints import StickingJoint, friction_of, line_of, lock_of, with_sticking_joints
 from udkjax.scene.elements.bodies import GROUND, GROUND_FRAME_AT_REST
 from udkjax.scene.elements.joints import Constraint, Joint
 from udkjax.scene.mechanism import Mechanism
@@ -161,6 +161,21 @@ def phases_of(
     joints: Any = tuple(x.constraint for x in added)
     added_by = tuple((x.event, x.name) for x in added)
     return Phases(mechanisms, (analysis, with_all), joints, added_by, table, sticking=sticking)
+
+
+def events_and_phases(
+    mechanism: Any, events: Sequence[Event], analysis: Analysis | None
+) -> tuple[Any, tuple[Event, ...], Phases]:
+    """Return a mechanism with directed frictions, all events, those of joints that may stick among them, and their phases.
+
+    Args:
+        mechanism: The scene, or a system.
+        events: The events, expanded.
+        analysis: Its analysis; None for a system.
+    """
+    sticking = with_sticking_joints(mechanism, events)
+    found = (*events, *sticking.events)
+    return sticking.mechanism, found, phases_of(sticking.mechanism, found, analysis, sticking.joints)
 
 
 def _names_removed(mechanism: Mechanism, event: Event) -> frozenset[str]:

@@ -32,6 +32,51 @@ PARTS = ("numbers", "settings", "rows", "breaks", "rank_tol")  # arrays of a pha
 ALL = np.ones(1, bool)  # of one member
 
 
+class ValuesLayout:
+    """The values of conditions at states in the results of `EvaluateEvents`, one after another.
+
+    Args:
+        operation: the operation.
+        switches: the switches of the phases.
+    """
+
+    def __init__(self, operation: EvaluateEvents, switches: Switches):
+        conditions = operation.conditions
+        assert conditions is not None  # the operation evaluates them
+        n, E = operation.code.coordinate_count, conditions.own_count
+        self._directed, self._holds = list(operation.directed), np.flatnonzero(np.array(switches.rows, int) >= 0)
+        self._conditions, self._count = conditions, E
+        (self.size,) = operation.outputs((), 2)[0]
+        self._places, start = [], 0
+        for shape in ((n,), (E,), (E,), (E,), (E,), (E, n), (E, n)):  # of the fields of `StateValues` before directions
+            self._places.append((slice(start, start + math.prod(shape)), shape))
+            start += math.prod(shape)
+
+    def values(self, results: Float[Any, "b K"], xp: ModuleType) -> StateValues:
+        """Return the values of b states."""
+        b, conditions, E = len(results), self._conditions, self._count
+        values = [xp.reshape(results[:, place], (b, *shape)) for place, shape in self._places]
+        n = self._places[0][1][0]
+        start, end = self._places[-1][0].stop, results.shape[1] - (conditions.force_count + (conditions.forces is not None))
+        directions = [xp.zeros((b, E, n)), xp.zeros((b, E, n))]
+        if self._directed:
+            found = xp.reshape(results[:, start:end], (b, -1, len(self._directed), n))
+            for k in range(found.shape[1]):
+                directions[k] = _put(directions[k], self._directed, found[:, k], xp)
+        forces, safe = xp.ones((b, E)), xp.ones(b, bool)
+        if conditions.force_count:
+            forces, safe = _put(forces, self._holds, results[:, end:-1], xp), results[:, -1] > 0.5
+        return StateValues._make([*values, *directions, forces, safe])
+
+
+def _put(x: Any, columns: Any, new: Any, xp: ModuleType) -> Any:
+    """Return an array with other columns; one of NumPy changes in place."""
+    if xp is not np:
+        return x.at[:, columns].set(new)
+    x[:, columns] = new
+    return x
+
+
 class PhasePlan(NamedTuple):
     """The operations of the phases of one mechanism; hashable."""
 
@@ -170,13 +215,7 @@ class PhaseCode:
         self._event_numbers, self._joints = event_numbers, joints
         rows = max(len(event_numbers), len(inverse_mass))
         self._numbers_of_states = np.concatenate([_spread(x, rows) for x in (event_numbers, inverse_mass)], axis=1)
-        assert plan.states.conditions is not None  # this code has conditions
-        n, E = inverse_mass.shape[1], plan.states.conditions.own_count
-        self._places, start = [], 0
-        for shape in ((n,), (E,), (E,), (E,), (E,), (E, n), (E, n)):  # of the fields of `StateValues` before directions
-            self._places.append((slice(start, start + math.prod(shape)), shape))
-            start += math.prod(shape)
-        self._switches, self._holds = switches, np.array(switches.rows, int) >= 0
+        self._layout, self._switches = ValuesLayout(plan.states, switches), switches
         places = np.concatenate([np.array(x or [-1] * width, int) for x, width in zip(plan.joints, widths, strict=True)])
         self._columns, self._first_side = np.flatnonzero(places >= 0), joints.shape[1] - widths[-1]
         self._places_of_joints = places[self._columns]
@@ -246,8 +285,7 @@ class PhaseCode:
     def at(self, members: Int[np.ndarray, "b"], state: RunState) -> StateValues:
         """Evaluate the conditions of members at states."""
         t, q, v, *_ = state
-        operation, conditions, (b, n) = self.plan.states, self.plan.states.conditions, q.shape
-        assert conditions is not None  # this code has conditions
+        b = len(q)
         numbers = self._with_samples(members, t, self._with_marks(members, state))
         given = tuple([x.tobytes() for x in (members, t, q, v, numbers)])
         if self._values is not None and given == self._seen:
@@ -259,19 +297,7 @@ class PhaseCode:
             of_states = _spread(of_states, b).copy()
             self._put_sides(of_states, members)
         (results,) = self._evaluate(*inputs, of_states)
-        results = results.copy()
-        values = [results[:, place].reshape(b, *shape) for place, shape in self._places]
-        directions, mobilities = np.zeros((2, b, conditions.own_count, n))
-        start, end = self._places[-1][0].stop, results.shape[1] - (conditions.force_count + (conditions.forces is not None))
-        if operation.directed:
-            found = results[:, start:end].reshape(b, -1, len(operation.directed), n)
-            for array, x in zip((directions, mobilities), found.swapaxes(0, 1), strict=False):
-                array[:, list(operation.directed)] = x
-        forces = np.ones((b, conditions.own_count))
-        if conditions.force_count:
-            forces[:, self._holds] = results[:, end:-1]
-        safe = results[:, -1] > 0.5 if conditions.force_count else np.ones(b, bool)
-        self._seen, self._values = given, StateValues._make([*values, directions, mobilities, forces, safe])
+        self._seen, self._values = given, self._layout.values(results.copy(), np)
         return self._values
 
     def project(self, members: Int[np.ndarray, "b"], state: RunState) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
