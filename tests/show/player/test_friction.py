@@ -8,7 +8,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax as udk
-from tests.show.player.pages import PLAYER
+from tests.friction import rubbing
+from tests.show.player.pages import PLAYER, until
 from udkjax.show.player.marks.measure_curves import measures_of
 from udkjax.show.player.pictures import svg
 
@@ -83,3 +84,20 @@ def test_a_live_page_shows_where_joints_stick_with_other_numbers(opened):
         assert_allclose(page.evaluate(f"[...{shown}.q]"), np.ravel(run.q), atol=1e-7)
         page.locator(".panel canvas").press("Backspace")
         assert page.evaluate(f"{shown}.sticking[0].spans") == first
+
+
+@pytest.mark.slow
+def test_a_live_page_of_a_redundant_lift_with_friction(opened):
+    """Redundant rows share the loads that its friction depends on."""
+    lift, ts, given = rubbing(udk.library.scissor_lift()), np.linspace(0.0, 0.3, 31), {"gravity[1]": -6.0}
+    other = lift.with_parameters(given)
+    run = udk.simulate(other, ts)
+    frictions = [name for name, force in lift.forces.items() if isinstance(force, udk.Friction)]
+    with opened(udk.animate(lift, udk.simulate(lift, ts), live=list(given))) as page:
+        page.evaluate(f"{PLAYER}.live.change({given})")
+        shown = f"{PLAYER}.live.runs[0].run"
+        until(page, f"{shown}.ts.length === {len(ts)}")
+        assert_allclose(page.evaluate(f"[...{shown}.q]"), np.ravel(run.q), atol=1e-7)
+        power = page.evaluate(f"[...{shown}.measures.find(m => m.name === 'power of friction').values]")
+        balance = udk.power_balance(other, run).forces
+        assert_allclose(power, sum(np.asarray(balance[name]) for name in frictions), rtol=1e-5, atol=1e-5)
