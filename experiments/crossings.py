@@ -20,6 +20,7 @@ import warnings
 from collections import Counter
 from collections.abc import Iterable
 
+import jax
 import numpy as np
 import xarray
 from matplotlib.colors import ListedColormap
@@ -52,6 +53,7 @@ def study(smoke: bool, first: int = 0, every: int = 1, add: bool = False) -> xar
     for name in tracked(models, "crossings"):
         case = Case(name, MODELS[name])
         found += [cell(row, case) for row in functions]
+        jax.clear_caches()  # a process may have only so many programs, and no other model uses these
     data = _dataset(found)
     if add and data_file("crossings").exists():
         data = _merged(load("crossings"), data)
