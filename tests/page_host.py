@@ -22,10 +22,11 @@ def page_run(
     folder: Path,
     tol: float,
     changed: Mapping[str, float] | None = None,
+    steps: int = 0,
 ) -> dict[str, Any]:
     """Return a run of the page's engine, with changed numbers, and its measures; the events by name, with their times.
 
-    Skips the test where Node.js is missing.
+    With `steps` it is computed in parts of so many steps. Skips the test where Node.js is missing.
     """
     if (node := shutil.which("node")) is None:
         pytest.skip("node is not installed")
@@ -34,10 +35,13 @@ def page_run(
     script = f"""
         const engine = await loadEngine({json.dumps(engine.data)}), times = Float64Array.from({json.dumps(ts.tolist())});
         const values = {json.dumps(list(changed.values()) if changed else None)}, state = engine.close(values);
-        const found = engine.run(values, state, times), measures = engine.measure(values, found, true, true);
-        const list = x => x && [...x];
+        const parts = new PartRun(engine, values, state, times);
+        let count = 0;
+        if ({steps}) do count += 1; while (parts.goOn({steps}));
+        const found = count ? {{...parts.run, done: parts.done, words: parts.words}} : engine.run(values, state, times);
+        const measures = engine.measure(values, found, true, true), list = x => x && [...x];
         console.log(JSON.stringify({{q: list(found.q), v: list(found.v), done: found.done, words: found.words, count: found.count,
-            events: found.events.map(e => [engine.data.events.names[e.index], e.t]), kinetic: list(measures.kinetic),
+            events: found.events.map(e => [engine.data.events.names[e.index], e.t]), kinetic: list(measures.kinetic), parts: count,
             friction: list(measures.friction), efforts: Object.entries(measures.efforts).map(([k, x]) => [k, list(x)])}}));
     """
     (folder / "script.mjs").write_text(module() + script, encoding="utf-8")

@@ -9,6 +9,7 @@ from numpy.testing import assert_allclose
 
 import udkjax as udk
 from benchmarks.friction import with_friction
+from examples.gallery import woodpecker
 from tests.friction import rubbing
 from tests.integrate.events.event_scenes import BALL, CATCH, CAUGHT, PENDULUM, floor
 from tests.page_host import page_run
@@ -89,6 +90,19 @@ def test_a_run_of_a_page_is_that_of_python(tmp_path, name):
     rubs = [force for force, x in mechanism.forces.items() if isinstance(x, udk.Friction)]
     if rubs and not events:
         assert_allclose(found["friction"], sum(np.asarray(balance.forces[x]) for x in rubs), rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["balls", pytest.param("woodpecker", marks=pytest.mark.slow)])
+def test_a_run_in_parts_is_the_whole_run(tmp_path, name):
+    """A part is over after some steps, or after some events, which take longer than steps."""
+    (mechanism, events), ts = woodpecker.toy() if name == "woodpecker" else balls(), np.linspace(0.0, 1.2, 31)
+    whole = page_run(mechanism, ts, events, tmp_path, TOL)
+    parts = page_run(mechanism, ts, events, tmp_path, TOL, steps=50)
+    assert parts["done"] and parts["parts"] > (10 if name == "woodpecker" else 1)
+    assert [n for n, _ in parts["events"]] == [n for n, _ in whole["events"]]
+    assert_allclose([t for _, t in parts["events"]], [t for _, t in whole["events"]], rtol=0, atol=1e-9)
+    assert_allclose(parts["q"], whole["q"], rtol=0, atol=1e-8)
+    assert_allclose(parts["kinetic"], whole["kinetic"], rtol=1e-6, atol=1e-9)
 
 
 def test_a_page_says_why_a_motion_ends(tmp_path):

@@ -1,6 +1,10 @@
 // Runs with events: machine code integrates from one event to the next, and the module `instants` does all that happens at an event:
 // impacts, contacts that come to rest, joints that stick. Both are compiled from the text of Python's own runs.
 
+// How often an event goes through its code, as a step goes once through its own: with some ten evaluations of conditions. A part of
+// a run (part_run.js) counts an event as the steps that take as long.
+const PASSES = 15;
+
 /** The block of numbers of a run: its parts by name, each an array in the memory of the module. */
 class Block {
   constructor(instance) {
@@ -96,6 +100,7 @@ export function runWithEvents(engine, numbers, settings, state, ts, stops, limit
   const run = new EventMotion(engine, numbers, settings), {block} = run;
   const found = {ts, q: new Float64Array(T * n), v: new Float64Array(T * n), violation: new Float64Array(T), modes: Array(T).fill(null), count: 0,
     events: [], steps: 0, tried: 0, done: false, limited: false, words: "", stop: null};
+  const {instances: {instants, run: {module: {bytes}}}} = engine, isPart = limit < settings.max_steps, stepsOfEvent = PASSES * instants.module.bytes / bytes;
   let first = 0, violation = 0, mode = null;
   const put = (row, q, v, open) => { found.q.set(q, row * n); found.v.set(v, row * n); found.violation[row] = open; found.modes[row] = mode; };
   const now = () => block.number("t"), putNow = () => put(first++, block.part("q"), block.part("v"), violation);
@@ -146,6 +151,7 @@ export function runWithEvents(engine, numbers, settings, state, ts, stops, limit
     }
     if (found.events.length >= events.most) return finish(`more than ${events.most} events`);
     if (block.number("event") !== events.no_event) continue;  // another event at the same instant
+    if (isPart && found.tried + stepsOfEvent * found.events.length >= limit) return finish("", {limited: true});
     const times = Float64Array.of(now(), ...ts.subarray(first)), part = run.advance(times, limit - found.tried);
     found.steps += part.steps;
     found.tried += part.tried;
