@@ -42,7 +42,8 @@ def page_run(
         const measures = engine.measure(values, found, true, true), list = x => x && [...x];
         console.log(JSON.stringify({{q: list(found.q), v: list(found.v), done: found.done, words: found.words, count: found.count,
             events: found.events.map(e => [engine.data.events.names[e.index], e.t]), kinetic: list(measures.kinetic),
-            parts: count, friction: list(measures.friction), efforts: Object.entries(measures.efforts).map(([k, x]) => [k, list(x)])}}));
+            parts: count, friction: list(measures.friction),
+            efforts: Object.entries(measures.efforts).map(([k, x]) => [k, list(x)])}}));
     """
     (folder / "script.mjs").write_text(module() + script, encoding="utf-8")
     done = subprocess.run([node, folder / "script.mjs"], capture_output=True, text=True)
