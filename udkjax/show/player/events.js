@@ -1,7 +1,7 @@
 // Runs with events: machine code integrates from one event to the next, and the module `instants` does all that happens at an event:
 // impacts, contacts that come to rest, joints that stick. Both are compiled from the text of Python's own runs.
 
-// How often an event goes through its code, as a step goes once through its own: with some ten evaluations of conditions. A part of
+// A step goes once through its code, and an event so many times through its own, as it evaluates conditions some ten times. A part of
 // a run (part_run.js) counts an event as the steps that take as long.
 const PASSES = 15;
 
