@@ -3,7 +3,7 @@
 
 // An event takes as long as some 15 steps by code of the same size: it evaluates conditions ten times. A part of a run (part_run.js)
 // counts it as these steps.
-const STEPS = 15;
+const EVENT_STEPS = 15;
 
 /** The block of numbers of a run: its parts by name, each an array in the memory of the module. */
 class Block {
@@ -100,7 +100,7 @@ export function runWithEvents(engine, numbers, settings, state, ts, stops, limit
   const run = new EventMotion(engine, numbers, settings), {block} = run;
   const found = {ts, q: new Float64Array(T * n), v: new Float64Array(T * n), violation: new Float64Array(T), modes: Array(T).fill(null), count: 0,
     events: [], steps: 0, tried: 0, done: false, limited: false, words: "", stop: null};
-  const {instances: {instants, run: {module: {bytes}}}} = engine, isPart = limit < settings.max_steps, stepsOfEvent = STEPS * instants.module.bytes / bytes;
+  const {instances: {instants, run: {module: {bytes}}}} = engine, isPart = limit < settings.max_steps, stepsOfEvent = EVENT_STEPS * instants.module.bytes / bytes;
   let first = 0, violation = 0, mode = null;
   const put = (row, q, v, open) => { found.q.set(q, row * n); found.v.set(v, row * n); found.violation[row] = open; found.modes[row] = mode; };
   const now = () => block.number("t"), putNow = () => put(first++, block.part("q"), block.part("v"), violation);
