@@ -3,6 +3,7 @@
 import json
 import re
 import tracemalloc
+from collections import Counter
 from html import unescape
 from importlib.resources import files
 
@@ -17,7 +18,7 @@ from udkjax.show.player.animation import FailedRunWarning
 from udkjax.show.player.marks.mark_places import body_points, corners_of, to_ground
 from udkjax.show.player.marks.marks import marks
 from udkjax.show.player.marks.measure_curves import measures_of, reaction_arrows
-from udkjax.show.player.page import page
+from udkjax.show.player.page import module, page
 from udkjax.show.player.player_data import PRECISION, run_record
 
 
@@ -340,3 +341,9 @@ def test_a_slot_is_drawn_on_its_lever_and_a_traced_end_has_a_dot():
     assert dot["body"] == lever and [lever, *dot["at"]] in run["traces"]
     ends = next(mark["points"] for mark in run["marks"] if mark["kind"] == "link" and mark["body"] == lever)
     assert min(np.linalg.norm(np.subtract(dot["at"], end)) for end in ends) < 1e-9
+
+
+def test_modules_of_a_page_have_different_names():
+    """They become one script, in which a name that two modules declare is a syntax error: no page would run."""
+    names = Counter(re.findall(r"^(?:async )?(?:const|let|class|function)\*? (\w+)", module(), re.MULTILINE))
+    assert len(names) > 50 and {name for name, count in names.items() if count > 1} == set()
