@@ -14,7 +14,7 @@ from jaxtyping import Array as JaxArray
 from udkjax.native.language.ir import DOUBLE
 from udkjax.native.lowering.arrays import Array, Stored
 from udkjax.native.lowering.lowering import Lowering
-from udkjax.native.lowering.varying import without_constants
+from udkjax.native.lowering.varying import parts_of, without_constants
 
 
 class ModuleCall(NamedTuple):
@@ -90,6 +90,5 @@ def _prepared_once(equations: Sequence[Any]) -> list[Any]:
 
 def _has_calls(equation: Any) -> bool:
     """Return whether the programs within an equation call functions of a module."""
-    parts = (x for p in equation.params.values() for x in (p if isinstance(p, tuple | list) else (p,)))
-    inner = (e for x in parts for e in getattr(without_constants(x), "eqns", ()))
+    inner = (e for part in parts_of(equation) for e in without_constants(part).eqns)
     return any(e.primitive is call_p or _has_calls(e) for e in inner)
