@@ -42,7 +42,7 @@ def page_run(
         const measures = engine.measure(values, found, true, true), list = x => x && [...x];
         console.log(JSON.stringify({{q: list(found.q), v: list(found.v), done: found.done, words: found.words, count: found.count,
             events: found.events.map(e => [engine.data.events.names[e.index], e.t]), kinetic: list(measures.kinetic),
-            parts: count, friction: list(measures.friction),
+            parts: count, friction: list(measures.friction), forces: list(measures.forces),
             efforts: Object.entries(measures.efforts).map(([k, x]) => [k, list(x)])}}));
     """
     (folder / "script.mjs").write_text(module() + script, encoding="utf-8")

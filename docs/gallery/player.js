@@ -929,6 +929,11 @@ class Engine {
     switches.forEach(([place, k]) => { found[place] = mode.phase[k]; });
     return found;
   }
+  /** Whether a row of Psi holds in a mode, by default that in which a run begins. */
+  holds(row, mode) {
+    const {events} = this.data, which = events?.switch_of_row[row] ?? -1;
+    return which < 0 || (mode?.phase ?? events.starts.phase)[which] > 0.5;
+  }
   /** The numbers of joints that events have added. */
   jointsIn(numbers) { return Float64Array.from(this.data.events.joints, place => (place < 0 ? 0 : numbers[place])); }
   /** All numbers of the scene, with the spring that pulls a body. */
@@ -1040,7 +1045,7 @@ class Engine {
     if (run.modes) return this.measureParts(parameters, run, efforts, forces);
     const {ts, q, v, count, mode, marks = null} = run;
     const {data, size} = this, module = this.instances.evaluate, {places} = module.module;
-    const rubs = efforts && data.friction, wanted = efforts ? data.efforts.filter(({row}) => !marks || marks[row]) : [], unique = !marks || marks.every(Boolean);
+    const rubs = efforts && data.friction, wanted = efforts ? data.efforts.filter(({row}) => !marks || marks[row]) : [], unique = !marks || marks.every((mark, row) => mark || !this.holds(row, mode));
     const numbers = this.inMode(this.numbers(parameters), mode), breaks = this.row ? this.breaks(numbers) : [];
     module.begin();
     const given = module.reserve(8 * (data.count + data.marks + 2)), work = module.reserve(8 * module.module.size);
@@ -1385,7 +1390,7 @@ class LiveRun {
   freedoms(state, values) {
     this.marks = state.marks = this.engine.mark(values, state);
     const rank = this.marks?.reduce((sum, x) => sum + x, 0) ?? state.rank;
-    return this.marks && state.rank < rank && rank === this.marks.length ? null : this.engine.size - rank;
+    return this.marks && state.rank < rank && this.marks.every((mark, row) => mark || !this.engine.holds(row)) ? null : this.engine.size - rank;
   }
   lengthOf(violation) { return `${(violation * this.engine.data.scales.length).toPrecision(2)} m`; }
   reset() {

@@ -14,6 +14,7 @@ from tests.friction import rubbing
 from tests.integrate.events.event_scenes import BALL, CATCH, CAUGHT, PENDULUM, floor
 from tests.page_host import page_run
 from udkjax.integrate.portable import portable_engine
+from udkjax.show.player.marks.measure_curves import reaction_arrows
 
 TOL = 1e-10
 
@@ -87,6 +88,10 @@ def test_a_run_of_a_page_is_that_of_python(tmp_path, name):
     balance = udk.power_balance(other, run)
     for driver, effort in found["efforts"]:
         assert_allclose(effort, udk.efforts(other, run)[driver], rtol=1e-6, atol=1e-6)
+    if name in ("limits", "slider-crank that rubs", "pendulum that sticks"):
+        _, forces, unique = reaction_arrows(other, run)
+        assert all(unique)
+        assert_allclose(np.reshape(found["forces"], forces.shape), forces, rtol=0, atol=1e-6 * np.abs(forces).max())
     rubs = [force for force, x in mechanism.forces.items() if isinstance(x, udk.Friction)]
     if rubs and not events:
         assert_allclose(found["friction"], sum(np.asarray(balance.forces[x]) for x in rubs), rtol=1e-6, atol=1e-6)

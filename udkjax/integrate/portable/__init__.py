@@ -13,7 +13,8 @@ events       null without events and joints with set-valued friction, else {name
              zero; watched: the conditions and forces that end a stretch of motion, directions: in which zeros count; zeros:
              bounds below which conditions count as zero, relative to their scales; zero: the same for forces; slowest: rate of
              the scene (1/s); most: largest number of events; head: number of entries of a crossing before the sides of
-             conditions; switches: [place in `numbers`, index in the phase]; joints: places of the numbers of joints that events
+             conditions; switches: [place in `numbers`, index in the phase]; switch_of_row: that
+             index for each row of Psi, -1 for rows that always hold; joints: places of the numbers of joints that events
              add, and of sides; sticking: by joint [index in the phase, index in `joints`] of two numbers, one of which is one
              while it sticks; no_event, results and words: codes of the instants, and why runs end}
 thresholds   thresholds of pivots, the inputs of a run after the numbers; closing uses those in `closing`

@@ -36,8 +36,6 @@ WORDS = {
     Result.event_impossible: "the constraints allow no impulse, or no friction obeys its law",
     Result.painleve_paradox: "no forces of the contacts obey the law of friction (Painleve's paradox)",
 }
-
-
 NAMED = Result.successful, Result.event_stop, Result.at_rest, Result.undefined_condition
 
 
@@ -147,6 +145,7 @@ class PortableEvents:
             "most": MOST_EVENTS,
             "head": Conditions.head,
             "switches": switching.places_of_switches(dressed, switches.names) if switches.names else [],
+            "switch_of_row": list(switches.switch_of_row),
             "joints": places,
             "sticking": {x.name: [int(lock), len(places) - plan.side_count + x.first + 1] for x, lock in locks},
             "starts": instants.starts,

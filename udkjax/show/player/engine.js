@@ -114,6 +114,12 @@ class Engine {
     return found;
   }
 
+  /** Whether a row of Psi holds in a mode, by default that in which a run begins. */
+  holds(row, mode) {
+    const {events} = this.data, which = events?.switch_of_row[row] ?? -1;
+    return which < 0 || (mode?.phase ?? events.starts.phase)[which] > 0.5;
+  }
+
   /** The numbers of joints that events have added. */
   jointsIn(numbers) { return Float64Array.from(this.data.events.joints, place => (place < 0 ? 0 : numbers[place])); }
 
@@ -239,7 +245,7 @@ class Engine {
     if (run.modes) return this.measureParts(parameters, run, efforts, forces);
     const {ts, q, v, count, mode, marks = null} = run;
     const {data, size} = this, module = this.instances.evaluate, {places} = module.module;
-    const rubs = efforts && data.friction, wanted = efforts ? data.efforts.filter(({row}) => !marks || marks[row]) : [], unique = !marks || marks.every(Boolean);
+    const rubs = efforts && data.friction, wanted = efforts ? data.efforts.filter(({row}) => !marks || marks[row]) : [], unique = !marks || marks.every((mark, row) => mark || !this.holds(row, mode));
     const numbers = this.inMode(this.numbers(parameters), mode), breaks = this.row ? this.breaks(numbers) : [];
     module.begin();
     const given = module.reserve(8 * (data.count + data.marks + 2)), work = module.reserve(8 * module.module.size);

@@ -1,8 +1,8 @@
 // Runs with events: machine code integrates from one event to the next, and the module `instants` does all that happens at an event:
 // impacts, contacts that come to rest, joints that stick. Both are compiled from the text of Python's own runs.
 
-// An event takes as long as some 15 steps by code of the same size: it evaluates conditions ten times. A part of a run (part_run.js)
-// counts it as these steps.
+// A part of a run (part_run.js) counts an event as this many steps by code of the same size. It decides only when a page responds: parts
+// of the woodpecker of the gallery, with 60 events, take 22 ms at most.
 const EVENT_STEPS = 15;
 
 /** The block of numbers of a run: its parts by name, each an array in the memory of the module. */

@@ -44,7 +44,7 @@ export class LiveRun {
   freedoms(state, values) {
     this.marks = state.marks = this.engine.mark(values, state);
     const rank = this.marks?.reduce((sum, x) => sum + x, 0) ?? state.rank;
-    return this.marks && state.rank < rank && rank === this.marks.length ? null : this.engine.size - rank;
+    return this.marks && state.rank < rank && this.marks.every((mark, row) => mark || !this.engine.holds(row)) ? null : this.engine.size - rank;
   }
 
   lengthOf(violation) { return `${(violation * this.engine.data.scales.length).toPrecision(2)} m`; }
