@@ -114,7 +114,7 @@ class Engine {
     return found;
   }
 
-  /** Whether a row of Psi holds in a mode, by default that in which a run begins. */
+  /** Return true if a row of Psi holds in a mode, by default that in which a run begins. */
   holds(row, mode) {
     const {events} = this.data, which = events?.switch_of_row[row] ?? -1;
     return which < 0 || (mode?.phase ?? events.starts.phase)[which] > 0.5;
