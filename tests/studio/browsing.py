@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 from contextlib import contextmanager
+from functools import cached_property
 from pathlib import Path
 
 COMMAND = "from udkjax.cli import main; main()"
@@ -115,6 +116,17 @@ class StudioPage:
         """Return the times (s) from an event to its drawing, and the longest task of the page."""
         answers, longest = self.page.evaluate("[watched.answers, watched.longest]")
         return [x / 1e3 for x in answers], longest / 1e3
+
+    def processor_time(self):
+        """Return the processor time (s) that the page's thread has taken since the first call, and the part of programs."""
+        found = {one["name"]: one["value"] for one in self._clock.send("Performance.getMetrics")["metrics"]}
+        return found["TaskDuration"], found["ScriptDuration"]
+
+    @cached_property
+    def _clock(self):
+        session = self.page.context.new_cdp_session(self.page)
+        session.send("Performance.enable", {"timeDomain": "threadTicks"})
+        return session
 
     def open(self, name, text):
         """Write a file, and open it without waiting for its motion."""

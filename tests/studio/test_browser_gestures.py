@@ -12,7 +12,7 @@ TEMPLATES = ("crank_rocker", "quick_return", "toggle_press", "cam_follower", "si
 GESTURES = 170  # on each of them
 SEEDS, EACH = 10, 100  # a thousand gestures on a six-bar whose motor runs into a dead point
 TOO_LONG = "504 (Gateway Timeout)"  # the server gives up a diagnosis that takes too long, and the page says so
-FRAME = 0.2  # s: the longest time for which the page may be busy
+FRAME = 0.2  # s of processor time: the longest for which the page may be busy
 DRAGS = {"crank_rocker": "a four-bar", "quick_return": "Whitworth's quick return", "six_bar": "a six-bar"}
 MOVES = 60  # of a drag
 AT_SIXTY = 1 / 60  # s: processor time of the page's thread for a frame, painting included
@@ -42,23 +42,16 @@ def test_drags_follow_at_sixty_frames_a_second_beside_the_answers(studio, templa
     studio.settle()
     studio.until("studio.motion.run?.count > 1 && studio.answers.element.querySelectorAll('dt').length > 0")
     assert studio.page.locator(".answers dt").first.is_visible()
-    session = studio.page.context.new_cdp_session(studio.page)
-    session.send("Performance.enable", {"timeDomain": "threadTicks"})
-
-    def spent():
-        found = {one["name"]: one["value"] for one in session.send("Performance.getMetrics")["metrics"]}
-        return np.array([found["TaskDuration"], found["ScriptDuration"]])
-
     moving = studio.js("Object.keys(studio.document.pins).filter(name => !studio.document.ground.includes(name))")
     x, y = studio.pin(moving[-1])
     studio.watch()
     studio.page.mouse.move(x, y)
     studio.page.mouse.down()
-    before = spent()
+    before = studio.processor_time()
     for k in range(1, MOVES + 1):
         studio.page.mouse.move(x + 0.4 * k, y + 6 * np.sin(k / 6))
         studio.page.wait_for_timeout(10)
-    task, script = (spent() - before) / studio.js("watched.frames")
+    task, script = np.subtract(studio.processor_time(), before) / studio.js("watched.frames")
     studio.page.mouse.up()
     answers = studio.watched()[0]
     frame = f"{1e3 * task:.1f} ms a frame, {1e3 * script:.1f} of it by programs"
@@ -77,11 +70,13 @@ def gesticulate(studio, name, seed, count):
     moves = 0
     for k in range(count):
         studio.js("watched.longest = 0")
+        before, _ = studio.processor_time()
         done = gestures()
         studio.problems[:] = [said for said in studio.problems if TOO_LONG not in said]
         assert studio.problems == [], (k, done, studio.problems)
         moves += studio.js("Boolean(studio.motion.pageEngine) && studio.motion.run?.count > 1")
-        longest.append((studio.watched()[1], f"{k}: {done}"))
+        # On a busy machine a task lasts longer than it needs: no task needs more than the gesture.
+        longest.append((min(studio.watched()[1], studio.processor_time()[0] - before), f"{k}: {done}"))
     print(f"{name}: moved after {moves} of {count} gestures; longest tasks of the page (s):", sorted(longest)[-5:])
     assert moves > 0
     slow = [one for one in longest if one[0] > FRAME]
