@@ -4,16 +4,17 @@ A given coordinate is a constant driver, or a row of Psi; a given velocity is a 
 are closed first, with the coordinates alone, so that a coordinate may be given without its velocity.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple, TypeAlias
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from udkjax.annotations import NumberLike
-from udkjax.arrays import number
+from udkjax.arrays import is_traced, number
 from udkjax.equations.systems.general import ConstrainedSystem
 from udkjax.positions.assembling.channels import RATES, channel_of
 from udkjax.positions.assembling.coordinates import Coordinate, coordinate_of, value_of
@@ -22,10 +23,12 @@ from udkjax.requirements import ArgumentError, describe, require_text
 from udkjax.scene.elements.bodies import COORDINATES
 from udkjax.scene.elements.drivers import Polynomial
 from udkjax.scene.mechanism import Mechanism
+from udkjax.scene.numbers.origin import Origin
 from udkjax.scene.tables.checks import SceneError
 from udkjax.wording import quote
 
 GivenValues: TypeAlias = Mapping[str, NumberLike]
+_Motions: TypeAlias = Mapping[str, tuple[Coordinate, Sequence[Array]]]  # by name, coefficients of powers of the time
 _COORDINATE_OF: dict[str, str] = dict(zip(RATES, COORDINATES, strict=True))  # vx: x, ...
 
 
@@ -112,12 +115,23 @@ class _GivenCoordinates(NamedTuple):
 
     def impose(self, coordinates: Mapping[str, tuple[Coordinate, Array]], *at: Any) -> Mechanism:
         """Return the mechanism with further drivers, of constant coordinates, or, `at` time t and position q, of given rates."""
+        motions = {
+            name: (c, [value_of(self.model, c)(at[1]) - x * at[0], x] if at else [x]) for name, (c, x) in coordinates.items()
+        }
+        if not self.model.is_concrete or not is_traced(motions):
+            return self._driven(motions)
+        # As of other mechanisms whose numbers have become traced, the redundant rows are those of a concrete one, here with the
+        # values of its guess: where they are unknown, machine code has no second derivatives.
+        with jax.ensure_compile_time_eval():
+            values = {name: value_of(self.model, c)(self.model.q0) for name, (c, _) in coordinates.items()}
+            guessed = {name: (c, [values[name], *map(jnp.zeros_like, x[1:])]) for name, (c, x) in motions.items()}
+            origin = Origin(self._driven(guessed))
+        return self._driven(motions, origin)
 
-        def motion(coordinate: Coordinate, x: Array) -> Polynomial:
-            return Polynomial(jnp.stack([value_of(self.model, coordinate)(at[1]) - x * at[0], x] if at else [x]))
-
-        more = {f"given {name}": c.driver(motion(c, x)).complete() for name, (c, x) in coordinates.items()}
-        return self.model.with_drivers({**self.model.drivers, **more})
+    def _driven(self, motions: _Motions, origin: Origin | None = None) -> Mechanism:
+        """Return the mechanism with further drivers, whose motions are polynomials of time."""
+        more = {f"given {name}": c.driver(Polynomial(jnp.stack(x))).complete() for name, (c, x) in motions.items()}
+        return self.model.with_drivers({**self.model.drivers, **more}, origin)
 
 
 def _value_called(name: str, value: Any) -> Float[Array, ""]:
