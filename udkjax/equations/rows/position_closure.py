@@ -132,8 +132,11 @@ def _fixed(x: Any) -> Any:
     return jax.lax.stop_gradient(x) if eqx.is_array(x) else x
 
 
-def damped_step(rows: Rows[jax.Array], t: Time, q: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return q after one step, halved until the residual falls, and whether it fell. At rounding level no step is taken."""
+def damped_step(rows: Rows[jax.Array], t: Time, q: jax.Array, goes_on: bool = False) -> tuple[jax.Array, jax.Array]:
+    """Return q after one step, halved until the residual falls, and whether it fell.
+
+    At rounding level, or if no step lowers the residual, q stays, or, if it `goes_on`, takes the step all the same.
+    """
     fixed, current = jax.tree.map(_fixed, (rows, q))
     size = jnp.linalg.norm(fixed.residual(t, current))
     is_open = size > rounding(rows.scales, current, jnp)
@@ -148,6 +151,8 @@ def damped_step(rows: Rows[jax.Array], t: Time, q: jax.Array) -> tuple[jax.Array
     halve = lambda trial: (0.5 * trial[0], trial[1] + 1)  # noqa: E731
     scale, k = jax.lax.while_loop(is_worse, halve, (jnp.ones(()), 0))
     improves = (k < CLOSURE.halvings) & is_open
+    if goes_on:
+        return q + jnp.where(improves, scale, 1.0) * step, improves
     return jnp.where(improves, q + scale * step, q), improves
 
 

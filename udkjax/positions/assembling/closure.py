@@ -1,12 +1,10 @@
 """Closure of a mechanism as a function of its numbers, by machine code or JAX, with derivatives of any order."""
 
 import operator
-from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from udkjax.annotations import Number, Time
@@ -15,6 +13,7 @@ from udkjax.equations.rows.analysis import Analysis
 from udkjax.equations.rows.position_closure import CLOSURE, Assembly, close_position, damped_step
 from udkjax.equations.states.quantities import equations_of
 from udkjax.equations.states.textbook import TextbookEquations
+from udkjax.equations.terms import constraints
 from udkjax.pinv import SVD
 from udkjax.positions.assembling import native_closing
 from udkjax.programs.undefined import defined_along
@@ -51,31 +50,36 @@ class TracedRows(NamedTuple):
 
     equations: TextbookEquations
 
+    @classmethod
+    def of(cls, mechanism: Mechanism, analysis: Analysis) -> "TracedRows":
+        """Return the rows of a mechanism."""
+        return cls(equations_of(mechanism, SVD(), analysis=analysis))
+
     @property
     def scales(self) -> Scales:
         return self.equations.scales
 
     def residual(self, t: Time, q: Array) -> Array:
-        return self.equations.violation(t, q, q)[0] / self.scales.rows
+        return constraints.psi(self.equations.mechanism, t, q) / self.scales.rows
 
     def correction(self, t: Time, q: Array) -> Array:
         plus, psi, root = self.equations.linearized_position(t, q)
         return -root * (plus @ psi)
 
-    def assemble(self, close: Callable[["TracedRows", Time, Array], Array], t: Time, q: Array, v: Array) -> Assembly[Array]:
-        """Return q closed by `close`, v projected onto the constraints, the remaining Psi and Psi_dot, and the rank of D."""
-        if not self.equations.constrained:
-            return q, v, *self.equations.violation(t, q, v), 0
-        q, rank = close(self, t, q), 0
-        for _ in range(CLOSURE.velocities):
-            plus, residual, root = self.equations.linearized_velocity(t, q, v)
-            v, rank = v - root * (plus @ residual), plus.rank
-        return q, v, *self.equations.violation(t, q, v), rank
+    def project(self, t: Time, q: Array, v: Array) -> tuple[Array, Array]:
+        """Return v after a Newton step to the constraints, and the rank of D."""
+        plus, residual, root = self.equations.linearized_velocity(t, q, v)
+        return v - root * (plus @ residual), plus.rank
 
 
 def close_by_jax(mechanism: Mechanism, analysis: Analysis, t: Float[Array, ""], q: Float[Array, "n"], v: Array) -> Closed:
     """Return q and v closed, the residuals Psi and Psi_dot, and the rank of D."""
-    return TracedRows(equations_of(mechanism, SVD(), analysis=analysis)).assemble(_close_position, t, q, v)
+    rows, rank = TracedRows.of(mechanism, analysis), 0
+    if mechanism.constraints:
+        q = _close_position(rows, t, q)
+        for _ in range(CLOSURE.velocities):
+            v, rank = rows.project(t, q, v)
+    return q, v, *rows.equations.violation(t, q, v), rank
 
 
 def close_by_machine_code(
@@ -110,7 +114,12 @@ class AssemblyFunction(DifferentiableFunction):
         return self.guess.rest[1].redundant_rows == ()
 
     def __call__(self, inputs: list[Array]) -> list[Array]:
-        return list(close_by_jax(*self.guess(inputs))[:2])
+        mechanism, analysis, t, q, v = self.guess(inputs)
+        if not mechanism.constraints:
+            return [q, v]
+        rows = TracedRows.of(mechanism, analysis)
+        q = _close_position_plain(rows, t, q)
+        return [q, rows.project(t, q, v)[0]]  # a second projection would remove rounding errors
 
     def shapes(self, inputs: list[Array]) -> list[tuple[int, ...]]:
         *_, q, v = self.guess(inputs)
@@ -188,8 +197,7 @@ def _close_position_plain(rows: TracedRows, t: Array, q: Array) -> Array:
     """
 
     def body(q, _):
-        following, better = damped_step(rows, t, q)
-        return jnp.where(better, following, q + rows.correction(t, q)), None
+        return damped_step(rows, t, q, goes_on=True)[0], None
 
     return jax.lax.scan(body, q, None, length=CLOSURE.steps)[0]
 
