@@ -19,7 +19,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 
 from udkjax.annotations import Number, NumberLike
 from udkjax.argument_types import COORDINATES_OF_BODIES
-from udkjax.equations.terms.structure import ElementKind, element_kinds, evaluate_by_kind, numbers_as_vector
+from udkjax.equations.terms.structure import ElementKind, element_kinds, entries, evaluate_by_kind, numbers_as_vector
 from udkjax.programs.deferred import traced_once
 from udkjax.scene.elements.bodies import Frame
 from udkjax.scene.elements.joints import Constraint
@@ -147,8 +147,7 @@ def _in_order(kinds: Sequence[tuple[ElementKind, Array]]) -> Float[Array, "m"]:
     """Return rows of constraints sorted by kind in the order of their constraints."""
     rows = jnp.concatenate([jnp.ravel(rows) for _, rows in kinds])
     owner = np.concatenate([np.repeat(kind.members, rows.shape[1]) for kind, rows in kinds])
-    order = np.argsort(owner, kind="stable")
-    return rows if np.array_equal(order, np.arange(len(order))) else rows[order]
+    return entries(rows, np.argsort(owner, kind="stable")) if len(owner) else rows
 
 
 def rate_along_motion(f: Callable[[Array, Array], Array], t: NumberLike, q: BodyArray, v: BodyArray) -> Array:
@@ -159,7 +158,8 @@ def rate_along_motion(f: Callable[[Array, Array], Array], t: NumberLike, q: Body
 
 def bodies(state: BodyArray) -> Float[Array, "bodies 3"]:
     """Return q or v as an array (bodies, 3)."""
-    return vector(state).reshape(-1, 3)
+    is_flat = isinstance(state, list | tuple) or np.ndim(state) != 2
+    return vector(state).reshape(-1, 3) if is_flat else jnp.asarray(state, jnp.result_type(float))
 
 
 def vector(values: ArrayLike | Sequence[Number]) -> Float[Array, "n"]:

@@ -178,12 +178,13 @@ def element_kinds(
     return result
 
 
-def _entries(x: Float[Array, "bodies"], which: Int[np.ndarray, "n"]) -> Float[Array, "n"]:
-    """Return the entries of some bodies; contiguous ones, as in chains, take one operation, also in derivatives."""
+def entries(x: Float[Array, "m"], which: Int[np.ndarray, "n"]) -> Float[Array, "n"]:
+    """Return x[which] by one operation, also in derivatives; `which` is within the bounds of x and not empty."""
     start, count = int(which[0]), len(which)
-    if np.array_equal(which, np.arange(start, start + count)):
+    if np.array_equal(which, np.arange(start, start + count)):  # as in chains
         return x if count == len(x) else x[start : start + count]
-    return x.at[which].get(mode="promise_in_bounds", wrap_negative_indices=False)
+    each = jax.lax.GatherDimensionNumbers(offset_dims=(), collapsed_slice_dims=(0,), start_index_map=(0,))
+    return jax.lax.gather(x, np.asarray(which, np.int32)[:, None], each, slice_sizes=(1,), mode="promise_in_bounds")
 
 
 def evaluate_by_kind(
@@ -214,6 +215,6 @@ def evaluate_by_kind(
 
         columns = zip(*(jax.tree.leaves(elements[i]) for i in kind.members), strict=True)
         leaves = [jnp.asarray(numbers_as_vector(column)).reshape(-1, *np.shape(column[0])) for column in columns]
-        moving = [Frame(*(_entries(field, which) for field in fields)) for which in kind.bodies]
+        moving = [Frame(*(entries(field, which) for field in fields)) for which in kind.bodies]
         results.append((kind, jax.vmap(evaluate, axis_size=len(kind.members))(leaves, moving)))
     return results

@@ -8,12 +8,12 @@ import jax
 from jaxtyping import Array, Float, PyTree
 
 from udkjax.annotations import Number, Time
+from udkjax.equations import constraints
 from udkjax.equations.programs.scales import Scales
 from udkjax.equations.rows.analysis import Analysis
 from udkjax.equations.rows.position_closure import CLOSURE, Assembly, close_position, damped_step
 from udkjax.equations.states.quantities import equations_of
 from udkjax.equations.states.textbook import TextbookEquations
-from udkjax.equations.terms import constraints
 from udkjax.pinv import SVD
 from udkjax.positions.assembling import native_closing
 from udkjax.programs.undefined import defined_along

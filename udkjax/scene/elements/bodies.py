@@ -110,7 +110,8 @@ class Frame(NamedTuple):
 
     def vector(self, local: PlaneVector) -> Point:
         """Transform a vector from the body's frame to ground coordinates."""
-        return Point(self.cos * local[0] - self.sin * local[1], self.sin * local[0] + self.cos * local[1])
+        x, y = local[0], local[1]
+        return Point(self.cos * x - self.sin * y, self.sin * x + self.cos * y)
 
     def point(self, local: PlaneVector) -> Point:
         """Return the ground coordinates (m) of a point given in the body's frame."""
@@ -124,7 +125,8 @@ class Frame(NamedTuple):
 
     def local(self, vector: PlaneVector) -> Point:
         """Transform a vector from ground coordinates to the body's frame: the inverse of `vector`."""
-        return Point(self.cos * vector[0] + self.sin * vector[1], self.cos * vector[1] - self.sin * vector[0])
+        x, y = vector[0], vector[1]
+        return Point(self.cos * x + self.sin * y, self.cos * y - self.sin * x)
 
 
 GROUND_FRAME = Frame(0.0, 0.0, 0.0, 1.0, 0.0)  # for joints
