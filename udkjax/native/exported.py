@@ -1,4 +1,4 @@
-"""Compiled JAX functions as bytes for other processes: JAX's own export, with the texts of the machine code that it calls."""
+"""Compiled JAX functions as bytes for other processes: JAX's own export, with the texts of the machine code that they call."""
 
 import json
 import re
@@ -22,19 +22,19 @@ FORMAT = b"udkjax exported 1\n"
 def export_compiled(function: Callable[..., Any], *arguments: Any) -> bytes:
     """Compile a JAX function of arrays, such as a run, its gradient or a batch of runs, to bytes for other processes.
 
-    JAX's own export contains no machine code of udkjax, and refuses functions that call it. These bytes contain LLVM's texts of
-    this code as well, which `load_exported` compiles for the processor that it runs on.
+    JAX's own export contains no machine code of udkjax, and refuses functions that call such code. The bytes from this function
+    also contain the LLVM text of the machine code, which `load_exported` compiles for the processor that it runs on.
 
     Args:
         function: a function that JAX can trace, for the CPU.
-        arguments: arguments like those that it will have: their shapes count, not their values.
+        arguments: example arguments of the function: their shapes and types matter, their values do not.
 
     Returns:
-        The bytes.
+        The bytes, for `load_exported`.
 
     Raises:
         MissingExtraError: the extra `export` is not installed.
-        ArgumentError: the function calls Python, as runs by diffrax, runs with events, and forces that do not trace.
+        ArgumentError: the function calls Python, as do runs by diffrax, runs with events, and forces that JAX cannot trace.
     """
     require(*EXPORT)
     jitted: Any = function if hasattr(function, "lower") else jax.jit(function)
@@ -54,15 +54,16 @@ def export_compiled(function: Callable[..., Any], *arguments: Any) -> bytes:
 
 
 def load_exported(data: bytes) -> Callable[..., Any]:
-    """Load a function that `export_compiled` has written; its machine code is compiled for this processor, or read from disk.
+    """Load a function that `export_compiled` has written.
 
-    Load bytes of people you trust only: machine code can do anything.
+    Its machine code is compiled for this processor, or read from the cache on disk. Load only bytes from people whom you trust:
+    machine code can do anything.
 
     Args:
-        data: the bytes.
+        data: the bytes that `export_compiled` returned.
 
     Returns:
-        The function, of arrays like those for which it was exported.
+        The function. Its arguments must be arrays of the shapes and types for which it was exported.
 
     Raises:
         ArgumentError: the bytes are not those of an exported function.

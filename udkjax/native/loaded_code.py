@@ -1,4 +1,4 @@
-"""Machine code of operations: compiled once per operation, and called directly on concrete numbers."""
+"""The machine code of operations (operations.py): compiled once for each operation, and called directly on concrete numbers."""
 
 import ctypes
 import math
@@ -38,9 +38,9 @@ FEW = 2  # maximum number of members that run one after another: eight lanes tak
 
 @lru_cache(maxsize=1)  # a module takes ten times as much memory as its code
 def generate(operation: Operation, width: int, tangent_lanes: int) -> Memory:
-    """Write the module of an operation in `width` lanes; raise `UnsupportedError` if machine code does not support it.
+    """Return the module of an operation for `width` lanes, with its text; raise `UnsupportedError` if that is impossible.
 
-    `tangent_lanes` is the number of directions of a single member in the lanes of a tangent.
+    `tangent_lanes`: the number of directions that are computed together, in lanes, if there is a single member.
     """
     module = operation.module(width, tangent_lanes, processor.lanes())
     handlers = handler(module, "call_frame")
@@ -49,7 +49,7 @@ def generate(operation: Operation, width: int, tangent_lanes: int) -> Memory:
 
 
 class PreparedCall(NamedTuple):
-    """A call of machine code: its record, with the arrays that it points to."""
+    """A prepared call of machine code: the call record (module/memory.py), and the arrays to which it points."""
 
     run: Callable[[int], Any]
     record: ctypes.Array
@@ -59,7 +59,7 @@ class PreparedCall(NamedTuple):
     outputs: list[np.ndarray]
 
     def __call__(self) -> list[np.ndarray]:
-        """Return the outputs, which the next call overwrites; raise `MemoryError` if there is no memory for the computation."""
+        """Run the code and return the outputs, which the next call overwrites; raise `MemoryError` if memory was refused."""
         self.shared[:], address = (0, 0), ctypes.addressof(self.record)
         interrupts.handler().install()
         others = [shared_threads().submit(self.run, address) for _ in range(self.threads - 1)]
@@ -74,7 +74,7 @@ class PreparedCall(NamedTuple):
 
 
 def _wait_for(calls: Sequence[Future[Any]]) -> None:
-    """Wait for calls of machine code, even if interrupted meanwhile; raise their error, or the interruption."""
+    """Wait until all calls of machine code have ended, even after Ctrl-C; then raise the interruption, or an error of a call."""
     interruption: BaseException | None = None
     for call in calls:
         while not call.done():
@@ -91,11 +91,11 @@ def _wait_for(calls: Sequence[Future[Any]]) -> None:
 class LoadedCode:
     """The machine code of one operation in `width` lanes.
 
-    If members leave for the module of a later operation, its code is loaded at the same level of optimization, and from then on
-    called directly.
+    When members first leave the module for that of the later operation (`Operation.later`), the code of the later module is
+    loaded at the same level of optimization, and is called directly from then on.
 
-    First calls use quickly compiled code, which runs slowly: only calls with few members and steps, and only until they have
-    taken a tenth of the time of compiling optimized code. Both codes round equally.
+    The first calls use code that is compiled quickly and runs slowly, if they have few members and steps, and until they have
+    taken a tenth of the time that compiling optimized code takes. Both codes give the same results, bit for bit.
     """
 
     def __init__(self, operation: Operation, width: int, tangent_lanes: int):
@@ -117,21 +117,22 @@ class LoadedCode:
 
     @property
     def name(self) -> str:
-        """The name of the FFI target in XLA, in programs of the CPU."""
+        """The name of the optimized code as an FFI target of XLA in programs of the CPU; the first access registers the code."""
         return (self._later or self).code(machine.LEVEL).name
 
     @property
     def name_on_card(self) -> str:
-        """The name of the FFI target in programs of a graphics card, which the host computes for it.
+        """The name of the FFI target in programs of a graphics card: a function with which the host computes for the card.
 
-        The driver calls it from threads of its own, which should not wait for Python: all its code is loaded here.
+        The driver calls this function from threads of its own, which should not wait for Python to load code. Therefore the
+        target is the code of the later operation, if there is one: it contains all functions that a run may need.
         """
         if self._operation.later:
             return LoadedCode(self._operation.later, *self._lanes).name_on_card
         return host_handler.register(self.name, self._optimized.library["call_frame"])
 
     def code(self, level: int) -> Code:
-        """Return the code of a level of optimization, compiled at its first use."""
+        """Return the code at a level of optimization, `machine.LEVEL` or `machine.QUICK`; its first use compiles it."""
         return self._optimized if level == machine.LEVEL else self._quick
 
     @cached_property
@@ -144,7 +145,10 @@ class LoadedCode:
         return self._load(machine.QUICK)
 
     def __call__(self, inputs: Sequence[np.ndarray], shapes: Sequence[tuple[int, ...]]) -> list[np.ndarray]:
-        """Return outputs of these shapes, computed by `thread_count` threads, or fewer if there are few members."""
+        """Return the outputs for these inputs, arrays of the given shapes.
+
+        They are computed by `thread_count` threads, or by fewer if there are few members.
+        """
         if self._later:
             return self._later(inputs, shapes)
         if self._seconds > 0.0 and shapes[0][0] <= QUICK_MEMBERS and self.is_quick(inputs):
@@ -154,9 +158,9 @@ class LoadedCode:
         return (self._later or self).prepare(inputs, shapes)()
 
     def is_quick(self, inputs: Sequence[np.ndarray]) -> bool:
-        """Return whether quickly compiled code runs a call with few members.
+        """Return True if quickly compiled code is to run a call with few members and these inputs.
 
-        It needs a limit of steps, which reverse mode cannot meet where it integrates again.
+        Such a call must end after a limited number of steps. The second pass of reverse mode cannot do so if it integrates again.
         """
         if self._seconds <= 0.0 or self._quick.library.is_optimized:
             return False
@@ -181,7 +185,10 @@ class LoadedCode:
         return outputs
 
     def prepare(self, inputs: Sequence[np.ndarray], shapes: Sequence[tuple[int, ...]], code: Code | None = None) -> PreparedCall:
-        """Return a call that can be repeated with other numbers in `inputs`, which are the given arrays if these are float64."""
+        """Return a call of `code`, by default of the optimized code, which may be repeated with other numbers in its `inputs`.
+
+        The arrays of `PreparedCall.inputs` are the given ones if these are contiguous and of float64; otherwise they are copies.
+        """
         code, inputs = code or self._optimized, [np.ascontiguousarray(x, np.float64) for x in inputs]
         outputs = [np.full(shape, np.nan) for shape in shapes]
         members, times, knots = shapes[0][0], inputs[TIMES].shape[1], inputs[BREAKS].shape[1]
@@ -202,7 +209,10 @@ class LoadedCode:
 
 
 def _load_later(owner: Callable[[], LoadedCode | None], operation: Operation, lanes: tuple[int, int], level: int) -> Code:
-    """Return the code of the later operation, which its owner calls from then on."""
+    """Return the code of the later operation `operation`, and make its owner call this code from then on.
+
+    `owner()` returns the `LoadedCode` of the first operation, or None if it has been deleted.
+    """
     later, loaded = LoadedCode(operation, *lanes), owner()
     if loaded is not None:
         loaded._later = later
@@ -211,19 +221,19 @@ def _load_later(owner: Callable[[], LoadedCode | None], operation: Operation, la
 
 @cached_by_size(lambda code: code.size)
 def machine_code(operation: Operation, width: int, tangent_lanes: int) -> LoadedCode:
-    """Return the machine code of an operation."""
+    """Return the machine code of an operation, from the cache if it has been requested before."""
     return LoadedCode(operation.first, width, tangent_lanes)
 
 
 def call_concrete(operation: Operation, inputs: Sequence[np.ndarray], times: int) -> list[np.ndarray]:
-    """Run an operation on concrete numbers of one member, without tracing."""
+    """Return the outputs of an operation for one member, without tracing; `inputs` are concrete arrays (1, ...)."""
     if operation.code.shares_by_marks:
         return call_by_rows(call_members, inputs, operation, times)
     return machine_code(operation, 1, 1)(inputs, operation.shapes(inputs, times))
 
 
 def select_code(inputs: Sequence[Any], operation: Operation) -> LoadedCode:
-    """Return the code for the members and directions of these inputs: in lanes, or one after another if they are few."""
+    """Return the code that suits the members and directions of these inputs: few members run one after another, more in lanes."""
     one_by_one = not operation.in_lanes or max(x.shape[0] for x in inputs) <= FEW
     directions = inputs[-1].shape[1] if operation.tangents and one_by_one and operation.code.is_small else 1
     tangent_lanes = min(2 ** math.ceil(math.log2(directions)), processor.lanes())  # shorter registers are faster
@@ -231,32 +241,33 @@ def select_code(inputs: Sequence[Any], operation: Operation) -> LoadedCode:
 
 
 def call_members(*inputs: np.ndarray, operation: Operation, times: int) -> list[np.ndarray]:
-    """Run an operation on concrete numbers of any number of members."""
+    """Return the outputs of an operation for any number of members; `inputs` are concrete arrays (1 or members, ...)."""
     if operation.code.shares_by_marks:
         return call_by_rows(call_members, inputs, operation, times)
     return select_code(inputs, operation)(inputs, operation.shapes(inputs, times))
 
 
 class MemberCalls:
-    """Calls of one operation on concrete numbers of any number of members."""
+    """A function that runs one operation on concrete numbers, and keeps a prepared call for inputs of the same shapes."""
 
     def __init__(self, operation: Operation):
         self._operation, self._shapes, self._lock = operation, (), Lock()
         self._prepared: PreparedCall | None = None
 
     def __call__(self, *inputs: np.ndarray, times: int) -> list[np.ndarray]:
-        """Return the outputs."""
+        """Return the outputs for any number of members, at `times` output times."""
         return call_members(*inputs, operation=self._operation, times=times)
 
     def of_one(self, *inputs: np.ndarray, times: int) -> list[np.ndarray]:
-        """Return the outputs of an operation as for `at_states`, for one member at some times."""
+        """Return copies of the outputs of `at_states`, for one member at `times` output times; threads may call it at once."""
         with self._lock:
             return [x.copy() for x in self.at_states(*inputs, times=times)]
 
     def at_states(self, *inputs: np.ndarray, times: int = 2) -> list[np.ndarray]:
-        """Return the outputs, which the next call overwrites; arrays of the same shapes as in the last call are prepared already.
+        """Return the outputs, which the next call overwrites.
 
-        The operation writes all of its outputs, as one at single states does, and has no later operation.
+        If the inputs have the same shapes as in the last call, its prepared call is repeated. Therefore the operation must
+        write all of its outputs, as operations at single states do, and must not have a later operation.
         """
         if self._operation.code.shares_by_marks:
             return self(*inputs, times=times)

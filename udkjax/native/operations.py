@@ -1,7 +1,8 @@
 """The operations of machine code: a class for each, with its module and the shapes of its inputs and outputs.
 
-An operation defines its code up to the number of lanes. The first axis of inputs and outputs is that of the members, of length
-one for shared inputs. runs.py has the operations that integrate, position_operations.py those that compute positions.
+An operation determines its machine code except for the number of lanes. The first axis of all inputs and outputs is the axis of
+members; an input that all members share has length one along this axis. runs.py has the operations that integrate,
+position_operations.py those that compute positions.
 """
 
 from abc import ABC, abstractmethod
@@ -39,7 +40,7 @@ from udkjax.native.watching.event_states import EventStates
 
 @dataclass(frozen=True)
 class Operation(ABC):
-    """An operation on members of a scene."""
+    """A computation by machine code for each member of a batch: scenes with the programs `code`, each with its own numbers."""
 
     code: RunPrograms
 
@@ -51,22 +52,22 @@ class Operation(ABC):
 
     @property
     def all_settings(self) -> tuple[str, ...]:
-        """The names of all settings, including those of a formulation."""
+        """The names of all settings in the input "settings", in their order, including those of a formulation if there is one."""
         return self.settings
 
     @property
     def tangents(self) -> int:
-        """The number of inputs with directions, which come last."""
+        """The number of inputs that have an axis of directions; these inputs are the last. 0: there are no tangents."""
         return 0
 
     @property
     def first(self) -> "Operation":
-        """The same operation, whose module may leave members to that of `later`, which is loaded when one needs it."""
+        """The operation with which calls begin: this one, or a variant whose module can pass members on to that of `later`."""
         return self
 
     @property
     def later(self) -> "Operation | None":
-        """The operation to whose module members may leave; None if they never leave."""
+        """The operation whose module takes over members that leave the module of this operation; None: members never leave."""
         return None
 
     @abstractmethod
@@ -75,16 +76,16 @@ class Operation(ABC):
 
         Args:
             width: The number of lanes.
-            tangent_lanes: Number of directions of a single member in the lanes of a tangent.
-            vector: Number of float64 numbers in a register.
+            tangent_lanes: The number of directions that are computed together, in lanes, if there is a single member.
+            vector: The number of float64 numbers in a register.
         """
 
     @abstractmethod
     def outputs(self, inputs: Sequence[Any], times: int) -> list[tuple[int, ...]]:
-        """Return the shapes of the outputs of one member."""
+        """Return the shapes of the outputs of one member, without the axis of members; `times`: the number of output times."""
 
     def shapes(self, inputs: Sequence[Any], times: int) -> list[tuple[int, ...]]:
-        """Return the shapes of the outputs of all members."""
+        """Return the shapes of the outputs of all members, (members, ...)."""
         members = max([x.shape[0] for x in inputs])
         return [(members, *shape) for shape in self.outputs(inputs, times)]
 
@@ -100,7 +101,7 @@ class Operation(ABC):
         xp: ModuleType = jnp,
         further: Sequence[ArrayLike] = (),
     ) -> list[Any]:
-        """Pack the inputs of one member.
+        """Return the inputs of one member as arrays, in the order in which the machine code takes them.
 
         Args:
             numbers: All numbers of the scene and the two thresholds of pivots.
@@ -110,11 +111,11 @@ class Operation(ABC):
             settings: Settings by name; settings of other operations are ignored.
             rows: The scales of the rows of Psi.
             breaks: Times (s) where the motion is not smooth, in their order.
-            xp: jax.numpy, without derivatives, or NumPy if all inputs are concrete.
-            further: Further inputs.
+            xp: The library of the arrays: `jax.numpy`, whose arrays pass on no derivatives, or NumPy for concrete numbers.
+            further: The inputs of this operation beyond those above, each without the axis of members.
 
         Returns:
-            Arrays (1, ...).
+            Arrays of float64, (1, ...).
         """
         as_vector = partial(np.concatenate, axis=None) if xp is np else numbers_as_vector
         values = [settings[name] for name in self.all_settings]
@@ -145,12 +146,12 @@ class StateOperation(Operation):
 
     @property
     def reactions(self) -> "FindReactions":
-        """The operation that computes multipliers, if the pseudoinverse is dense."""
+        """The operation that computes the multipliers of states; it requires a dense pseudoinverse."""
         return FindReactions(self.code, self.pseudoinverse, self.formulation)
 
     @property
     def jump(self) -> "ProjectJump":
-        """The operation that projects states after events."""
+        """The operation that projects states after events, and returns by how much velocities then violate the constraints."""
         return ProjectJump(self.code, self.pseudoinverse, self.formulation)
 
     @property
@@ -159,7 +160,7 @@ class StateOperation(Operation):
         return FindTangentPart(self.code, self.pseudoinverse, self.formulation)
 
     def of_events(self, conditions: Conditions, directed: tuple[int, ...]) -> "EvaluateEvents":
-        """Return the operation that evaluates conditions and, for some of them, directions of impulses."""
+        """Return the operation that evaluates conditions and, for those with indices in `directed`, directions of impulses."""
         return EvaluateEvents(self.code, self.pseudoinverse, self.formulation, conditions, directed)
 
     def module(self, width: int, tangent_lanes: int, vector: int) -> Module:
@@ -170,13 +171,13 @@ class StateOperation(Operation):
 
 
 class Accelerate(StateOperation):
-    """Compute the accelerations of states."""
+    """The operation that computes the accelerations of states."""
 
     function = StateAccelerations
 
 
 class FindReactions(StateOperation):
-    """Compute the multipliers of all rows by a dense method, and the entries of Psi_q."""
+    """The operation that computes, for each state, the multipliers of all rows by a dense method, and the entries of Psi_q."""
 
     function = StateReactions
 
@@ -185,13 +186,16 @@ class FindReactions(StateOperation):
 
 
 class ProjectStates(StateOperation):
-    """Project states onto the constraint manifold."""
+    """The operation that projects states onto the constraint manifold."""
 
     function = StateProjection
 
 
 class ProjectJump(StateOperation):
-    """Project states after events onto the constraint manifold, and return the largest remaining row of Psi_dot per scale."""
+    """The operation that projects states after events onto the constraint manifold.
+
+    It also returns the largest row of Psi_dot that remains, divided by the scale of the row.
+    """
 
     function = StateJump
 
@@ -200,14 +204,14 @@ class ProjectJump(StateOperation):
 
 
 class FindTangentPart(StateOperation):
-    """Compute the tangent part of small changes of states."""
+    """The operation that computes the tangent part of small changes of states."""
 
     function = StateTangentPart
 
 
 @dataclass(frozen=True)
 class EvaluateEvents(StateOperation):
-    """Compute accelerations, conditions, directions of impulses and forces at states."""
+    """The operation that computes accelerations, conditions, directions of impulses and forces (watching/event_states.py)."""
 
     conditions: Conditions | None = None
     directed: tuple[int, ...] = ()  # indices of the conditions with directions of impulses
@@ -226,7 +230,7 @@ class EvaluateEvents(StateOperation):
 
 @dataclass(frozen=True)
 class MarkRows(Operation):
-    """Mark the rows of Psi that are independent near a position with one, others with zero."""
+    """The operation that marks the rows of Psi that are independent near a position: one for these rows, zero for others."""
 
     settings: ClassVar[tuple[str, ...]] = RowMarks.settings
 
@@ -239,7 +243,7 @@ class MarkRows(Operation):
 
 @dataclass(frozen=True)
 class FindScales(Operation):
-    """Compute the characteristic scales from the numbers of a scene."""
+    """The operation that computes the characteristic scales from the numbers of a scene."""
 
     settings: ClassVar[tuple[str, ...]] = ()
     in_lanes: ClassVar[bool] = False

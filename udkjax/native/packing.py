@@ -16,16 +16,16 @@ from udkjax.transforms.gradients import stop_gradients
 
 
 class ActiveNumbers:
-    """The numbers of a tree, some of which are active, that is, have derivatives.
+    """The numbers of a pytree, some of which are active: derivatives with respect to them are needed.
 
-    Machine code receives them as one vector, followed by two thresholds of pivots, which are inactive.
+    Machine code receives the numbers as one vector, followed by two thresholds of pivots, which are inactive.
 
     Args:
-        numbers: the tree; None where it has no number.
-        active: a tree of the same form, True for active numbers, False or None for all others.
+        numbers: the pytree of arrays; a leaf may be None in place of an array.
+        active: a pytree of the same form: True for active arrays, False or None for all others.
 
     Attributes:
-        mask: for each number, and for the two thresholds, whether it is active.
+        mask: True for each active number; False for the others and for the two thresholds.
     """
 
     def __init__(self, numbers: PyTree[Array], active: PyTree[bool]):
@@ -35,7 +35,7 @@ class ActiveNumbers:
         self.mask = (*(m is True for x, m in leaves if x is not None for _ in range(np.size(x))), False, False)
 
     def tangents(self, change: PyTree[Array]) -> Array:
-        """Return a change of the tree as one vector, with zeros for numbers that are not active."""
+        """Return a change of the pytree as one vector, with zeros for inactive numbers and for the two thresholds."""
         leaves = zip(self._numbers, self._active, leaves_and_none(change), strict=True)
         moving = [jnp.ravel(jnp.asarray(dx, float)) for x, m, dx in leaves if x is not None and m is True]
         mask = np.array(self.mask)
@@ -43,7 +43,7 @@ class ActiveNumbers:
         return jnp.concatenate([*moving, np.zeros(1)])[np.where(mask, np.cumsum(mask) - 1, np.sum(mask))]
 
     def cotangents(self, bars: Array) -> PyTree[Array]:
-        """Return the tree of the cotangents of active numbers, from a vector of the cotangents of all numbers."""
+        """Return the pytree of the cotangents, None for inactive arrays, from the vector of the cotangents of all numbers."""
         parts, place = [], 0
         for x, m in zip(self._numbers, self._active, strict=True):
             size = 0 if x is None else np.size(x)
@@ -53,7 +53,7 @@ class ActiveNumbers:
 
 
 def leaves_and_none(tree: PyTree) -> list[Any]:
-    """Return the leaves of a tree, including None."""
+    """Return the leaves of a pytree; each None counts as a leaf."""
     return jax.tree.leaves(tree, is_leaf=lambda x: x is None)
 
 
@@ -65,14 +65,18 @@ class SampleRows:
         self._breakpoints = breakpoints
 
     def breakpoints(self, xp: ModuleType) -> Any:
-        """Return the sorted breakpoints of the run; by NumPy if they are concrete."""
+        """Return the sorted breakpoints of the run, a NumPy array if they are concrete, otherwise an array of `xp`."""
         if self._breakpoints is None:
             return np.zeros(0)
         traced = isinstance(self._breakpoints, Tracer)
         return xp.sort(stop_gradients(self._breakpoints)) if traced else np.sort(np.asarray(self._breakpoints))
 
     def stand_in(self, mechanism: Mechanism, marks: bool = False) -> Mechanism:
-        """Return a mechanism, or a tree of its tangents or (with `marks`) active marks, with one row instead of all samples."""
+        """Return a mechanism in which one row of zeros takes the place of all samples.
+
+        `mechanism` may also be a pytree of tangents, in which samples without tangents stay None, or, with `marks`, of marks of
+        active numbers: then the row is marked True if any of the samples is.
+        """
         samples = {}
         for place, sampled in mechanism.samples.items():
             present = [leaf for leaf in leaves_and_none(sampled) if leaf is not None]
@@ -89,7 +93,10 @@ class SampleRows:
         return tuple(np.flatnonzero(np.concatenate([np.ravel(x) for x in marked.numbers])).tolist())
 
     def rows(self, xp: ModuleType, samples: Sequence[Any] | None = None) -> Any:
-        """Return the rows (K + 1, R), by default of the mechanism's samples."""
+        """Return the rows of R sampled numbers, one for each interval between K breakpoints: (K + 1, R).
+
+        `samples`: the samples; None: those of the mechanism.
+        """
         breakpoints = self.breakpoints(xp)
         columns = []
         for x in self.samples.values() if samples is None else samples:
@@ -105,14 +112,14 @@ class SampleRows:
         return xp.concatenate(columns, axis=1)
 
     def changes(self, mechanism: Mechanism) -> Array:
-        """Return the tangents of the rows from those of a mechanism."""
+        """Return the tangents of the rows, (K + 1, R), from `mechanism`, a pytree of the tangents of the mechanism."""
         leaves, form = jax.tree.flatten(list(self.samples.values()))
         given_tangents = leaves_and_none(list(mechanism.samples.values()))
         tangents = [jax.numpy.zeros(np.shape(x)) if dx is None else dx for x, dx in zip(leaves, given_tangents, strict=True)]
         return jax.jvp(lambda xs: self.rows(jax.numpy, jax.tree.unflatten(form, xs)), (leaves,), (tangents,))[1]
 
     def with_cotangents(self, mechanism: Mechanism, active: Mechanism, bars: Array) -> Mechanism:
-        """Return a mechanism of cotangents that includes the samples, from the cotangents of the rows."""
+        """Return `mechanism`, a pytree of cotangents, with those of the active samples, which follow from `bars`, of the rows."""
         leaves, form = jax.tree.flatten(list(self.samples.values()))
         marks = leaves_and_none(list(active.samples.values()))
         (sample_bars,) = jax.vjp(lambda xs: self.rows(jax.numpy, jax.tree.unflatten(form, xs)), leaves)[1](bars)

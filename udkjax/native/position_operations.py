@@ -13,7 +13,7 @@ from udkjax.native.operations import Operation
 
 @dataclass(frozen=True)
 class Close(Operation):
-    """Close a mechanism: the outputs are its state, the remaining Psi and Psi_dot, and the rank of Psi_q."""
+    """The operation that closes a mechanism. Its outputs are the state, the remaining Psi and Psi_dot, and the rank of Psi_q."""
 
     settings: ClassVar[tuple[str, ...]] = Closing.settings
     in_lanes: ClassVar[bool] = False
@@ -40,7 +40,7 @@ class Close(Operation):
 
 @dataclass(frozen=True)
 class CloseTangents(Close):
-    """Close, with the tangents of the state along directions."""
+    """The operation that closes a mechanism and computes the tangents of the state along directions."""
 
     active: tuple[bool, ...] = ()
 
@@ -57,7 +57,7 @@ class CloseTangents(Close):
 
 @dataclass(frozen=True)
 class CloseSecondTangents(CloseTangents):
-    """Close, with the second derivatives of the state along pairs of directions."""
+    """The operation that closes a mechanism and computes the second derivatives of the state along pairs of directions."""
 
     @property
     def tangents(self) -> int:
@@ -69,7 +69,7 @@ class CloseSecondTangents(CloseTangents):
 
 @dataclass(frozen=True)
 class CloseCotangents(Close):
-    """Close, and pull cotangents of the state back to all numbers and the guess."""
+    """The operation that closes a mechanism and pulls cotangents of the state back to all numbers and to the guess."""
 
     active: tuple[bool, ...] = ()
 
@@ -83,7 +83,11 @@ class CloseCotangents(Close):
 
 @dataclass(frozen=True)
 class March(Operation):
-    """Follow the positions of a driven mechanism over values: q, q', q'', sides, the number of sound ones, the last value."""
+    """The operation that follows the positions of a driven mechanism over the values of its driver (closing/marching.py).
+
+    Its outputs are q, q', q'' and the side of the position at each value, the number of sound positions, and the last value that
+    was reached.
+    """
 
     settings: ClassVar[tuple[str, ...]] = Marching.settings
 

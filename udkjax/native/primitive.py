@@ -31,13 +31,16 @@ def _call(*inputs: Any, operation: Operation, times: int) -> list[Array]:
 
 
 def _lower_on_cpu(context: Any, *inputs: Any, operation: Operation, times: int) -> Any:
-    """Lower for the CPU, with the devices of the program where they are known."""
+    """Lower the primitive for the CPU: members are divided among the devices of the program if these are known."""
     lowered = partial(_lower, divides=knows_devices(context))
     return mlir.lower_fun(lowered)(context, *inputs, operation=operation, times=times)
 
 
 def _lower(*inputs: Any, operation: Operation, times: int, divides: bool = False) -> Sequence[Array]:
-    """Call machine code; `divides` tells whether members may be divided among the devices of the program."""
+    """Return the outputs of machine code, called as a target of XLA.
+
+    `divides`: True if members may be divided among the devices of the program.
+    """
     if operation.code.shares_by_marks:
         return bind_by_rows(call_members, inputs, operation, times)
 
@@ -48,7 +51,7 @@ def _lower(*inputs: Any, operation: Operation, times: int, divides: bool = False
 
 
 def _lower_for_card(*inputs: Any, operation: Operation, times: int) -> Sequence[Array]:
-    """Lower for an NVIDIA graphics card: large batches run as a kernel; the host computes everything else."""
+    """Lower the primitive for an NVIDIA graphics card: large batches run as a kernel; the host computes everything else."""
 
     def call(inputs: Sequence[Any], operation: Operation) -> Sequence[Array]:
         kernel = kernel_target(operation, inputs)
@@ -66,7 +69,7 @@ def _lower_for_card(*inputs: Any, operation: Operation, times: int) -> Sequence[
 
 
 def _lower_for_others(*inputs: Any, operation: Operation, times: int) -> Sequence[Array]:
-    """Lower for all other devices: the host computes, called by JAX."""
+    """Lower the primitive for all other devices: JAX calls the host, which computes."""
     results = _result_shapes(inputs, operation, times)
     call = partial(call_members, operation=operation, times=times)
     return jax.pure_callback(lambda *arrays: call(*map(np.asarray, arrays)), results, *inputs)
@@ -77,7 +80,7 @@ def _result_shapes(inputs: Sequence[Any], operation: Operation, times: int) -> l
 
 
 def _call_target(name: str, inputs: Sequence[Any], operation: Operation, times: int) -> Sequence[Array]:
-    """Call a target of XLA."""
+    """Return the outputs of the FFI target of XLA with this name."""
     return jax.ffi.ffi_call(name, _result_shapes(inputs, operation, times))(*inputs)
 
 
@@ -88,7 +91,11 @@ def _abstract_eval(*inputs: Any, operation: Operation, times: int) -> list[Any]:
 def _batch(
     inputs: Sequence[Any], axes: Sequence[int | None], operation: Operation, times: int
 ) -> tuple[list[Any], list[int | None]]:
-    """Bind a batch as more members, or a batch only of directions as more directions; return results and their batch axes."""
+    """Batching rule: bind a batch as more members, or, if only directions are batched, as more directions.
+
+    Returns:
+        The results, and the axis of the batch of each; None if a result has no batch.
+    """
     size = next(x.shape[axis] for x, axis in zip(inputs, axes, strict=True) if axis is not None)
     first = [x if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in zip(inputs, axes, strict=True)]
     shared, results = len(inputs) - operation.tangents, operation.results
@@ -150,7 +157,7 @@ def _find_scales(numbers: Array, programs: Any) -> Array:
 
 
 def _scales_of_batch(numbers: np.ndarray, programs: Any) -> np.ndarray:
-    """Evaluate the primitive of scales outside compiled programs; for a few vectors by NumPy, without compilation."""
+    """Return the scales of each vector of `numbers`, outside compiled programs; for few vectors by NumPy, without compilation."""
     if numbers.size <= QUICK_MEMBERS * numbers.shape[-1] or unsupported(programs):
         return scales_p.by_numpy(numbers, programs)
     (scales,) = call_members(*_scale_inputs(np.asarray(numbers, float)), operation=FindScales(programs), times=1)

@@ -1,4 +1,4 @@
-"""Records between the two passes of reverse mode: whether a batch stores them, or integrates again in the second pass.
+"""Records between the two passes of reverse mode: a batch stores them, or it integrates again in the second pass.
 
 All stored records have the length of the longest one, so the records of a large batch would take far more memory than their steps
 need. The second pass of such a batch therefore makes the record of each member again, in the memory of the thread that runs it.
@@ -23,7 +23,7 @@ GIVEN_RECORD, GIVEN_STEPS = 5, 6  # places of the record and of the number of st
 
 
 def are_stored(inputs: Sequence[Any], operation: Operation, members: int, on_card: bool = False) -> bool:
-    """Return whether a pass of reverse mode over this number of members stores or reads records; True for other operations."""
+    """Return True if a pass of reverse mode over this number of members stores or reads records; True for other operations."""
     if not isinstance(operation, RunCotangents):
         return True
     if goes_back(inputs) and math.prod(inputs[-GIVEN_RECORD].shape[:-1]) == 1:  # all members share it
@@ -34,25 +34,25 @@ def are_stored(inputs: Sequence[Any], operation: Operation, members: int, on_car
 
 
 def without_records(inputs: Sequence[Any], operation: Any) -> tuple[list[Any], Any]:
-    """Return the inputs and the operation of a pass that neither stores nor reads records; its last output is empty."""
+    """Return the inputs and the operation for a pass that neither stores nor reads records, so that its last output is empty."""
     if goes_back(inputs):
         inputs = [x[..., :0] if k == len(inputs) - GIVEN_RECORD else x for k, x in enumerate(inputs)]
     return list(inputs), replace(operation, points=0)
 
 
 def absent_records(operation: Any, members: int) -> Array:
-    """Return records without points."""
+    """Return zeros in place of records, (members, record length), from which the second pass knows to integrate again."""
     return jnp.zeros((members, operation.record_length))
 
 
 def with_longest(inputs: Sequence[Any], operation: Operation) -> list[Any]:
-    """Return the inputs of a kernel; in the second pass with the steps of the longest run instead of those of each."""
+    """Return the inputs of a kernel; in the second pass all members share one number of steps, that of the longest run."""
     if not isinstance(operation, RunCotangents) or not goes_back(inputs):
         return list(inputs)
     return [jnp.max(x, axis=0, keepdims=True) if k == len(inputs) - GIVEN_STEPS else x for k, x in enumerate(inputs)]
 
 
 def are_given(inputs: Sequence[Any]) -> bool:
-    """Return whether all members have records in the inputs of the second pass."""
+    """Return True if the inputs of the second pass contain a record of every member."""
     given = inputs[-GIVEN_RECORD]
     return given.shape[1] > 0 and bool((given[:, 0] > 0.0).all())

@@ -24,7 +24,10 @@ from udkjax.native.watching.watching import Watching
 
 @dataclass(frozen=True)
 class RunStates(Operation):
-    """Integrate: the outputs are q, v, the violation of Psi, and how the run ended."""
+    """The operation that integrates.
+
+    Its outputs are q, v and the violation of Psi at each output time, and numbers that describe the end of the run (`INFO`).
+    """
 
     method: Method
     projected: bool
@@ -45,11 +48,14 @@ class RunStates(Operation):
 
     @property
     def closes(self) -> bool:
-        """True if the formulation closes each stage: derivatives are those of a run by the equation of Udwadia and Kalaba."""
+        """True if the formulation closes the state at each stage, as coordinate partitioning does.
+
+        Derivatives are then those of a run by the Udwadia-Kalaba equation.
+        """
         return self.formulation is not None and self.formulation.closes
 
     def plan(self, width: int, vector: int) -> Plan:
-        """Return the plan of the module's code."""
+        """Return the plan of the module, for `width` lanes and registers of `vector` numbers."""
         return Plan(
             code=self.code,
             method=self.method,
@@ -67,10 +73,14 @@ class RunStates(Operation):
         )
 
     def stabilized(self, stabilization: Any, methods: Mapping[str, Callable[..., Any]]) -> "RunStates":
-        """Return the operation with a user-defined stabilization, and its methods (`udkjax.integrate.stabilization`).
+        """Return this operation with a user-defined stabilization (`udkjax.integrate.stabilization`).
+
+        Args:
+            stabilization: The stabilization.
+            methods: The methods that the user has defined, by name: "rates", "end_of_step" or both.
 
         Raises:
-            UnsupportedError: the message says which operation has no machine code.
+            UnsupportedError: A method uses an operation without machine code; the message names it.
         """
         return replace(self, changes=False, stabilization=StabilizationCode.of(stabilization, methods, self.code))
 
@@ -84,7 +94,7 @@ class RunStates(Operation):
 
     @property
     def accelerations(self) -> Accelerate:
-        """The operation that computes accelerations at single states by the same method."""
+        """The operation that computes accelerations at single states, by the same pseudoinverse and formulation."""
         return Accelerate(self.code, self.pseudoinverse, self.formulation)
 
     @property
@@ -93,20 +103,23 @@ class RunStates(Operation):
         return AccelerateTangents(self.code)
 
     def with_tangents(self, active: tuple[bool, ...]) -> "RunTangents":
-        """Return the operation with tangents along directions of the active numbers of the scene and of the initial state."""
+        """Return the operation that also computes tangents along directions.
+
+        Directions are changes of the numbers of the scene marked in `active`, and of the initial state.
+        """
         return RunTangents(**self._for_derivatives, active=active)
 
     def with_second_tangents(self, active: tuple[bool, ...]) -> "RunSecondTangents":
-        """Return the operation with second derivatives along pairs of directions."""
+        """Return the operation that also computes second derivatives along pairs of directions (see `with_tangents`)."""
         return RunSecondTangents(**self._for_derivatives, active=active)
 
     def with_cotangents(self, active: tuple[bool, ...], breakpoints: int = 0, points: int | None = None) -> "RunCotangents":
         """Return the operation that backpropagates to the active numbers along a record.
 
         Args:
-            active: mask of the numbers of the scene.
+            active: for each number of the scene, True if its derivative is needed.
             breakpoints: number of times where the motion is not smooth.
-            points: capacity of the record of a run; None: sufficient for most runs.
+            points: capacity of the record of a run, in accepted states; None: a capacity that is sufficient for most runs.
         """
         points = points or record.STORED + record.PER_BREAKPOINT * breakpoints
         return RunCotangents(**self._for_derivatives, active=active, points=points)
@@ -130,7 +143,7 @@ class RunStates(Operation):
 
     @property
     def _for_derivatives(self) -> dict[str, Any]:
-        """The fields of this operation when it is differentiated; without the formulation if this `closes`."""
+        """The fields, by name, of the operation that is differentiated: without a formulation that `closes` states."""
         changed = {"code": self.code.for_derivatives} | ({"formulation": None} if self.closes else {})
         return {item.name: getattr(self, item.name) for item in fields(self)} | changed
 
@@ -144,14 +157,14 @@ class RunStates(Operation):
 
 @dataclass(frozen=True)
 class RunWatched(RunStates):
-    """Integrate up to the first crossing of conditions, or until a crossing cannot be ruled out."""
+    """The operation that integrates up to the first crossing of conditions, or until a crossing cannot be ruled out."""
 
     conditions: Conditions | None = None
     passing: Passing | None = None  # events that are recorded, and do not end the run
 
     @property
     def unwatched(self) -> RunStates:
-        """The operation that integrates to the last time, whatever the conditions."""
+        """The operation that integrates to the last time, without watching conditions."""
         return RunStates(**{item.name: getattr(self, item.name) for item in fields(RunStates)})
 
     def module(self, width: int, tangent_lanes: int, vector: int) -> Module:
@@ -167,7 +180,7 @@ class RunWatched(RunStates):
 
 @dataclass(frozen=True)
 class RunTangents(RunStates):
-    """Integrate, with the tangents of the states and of the end along directions."""
+    """The operation that integrates and computes the tangents of all output states, and of the last state, along directions."""
 
     active: tuple[bool, ...] = ()  # for each number of the scene, whether derivatives with respect to it are needed
 
@@ -186,7 +199,10 @@ class RunTangents(RunStates):
 
 @dataclass(frozen=True)
 class AccelerateTangents(Accelerate):
-    """Compute the accelerations of states, and their tangents along directions of all numbers of the scene and of states."""
+    """The operation that computes the accelerations of states with their tangents.
+
+    Directions are changes of all numbers of the scene, and of the state.
+    """
 
     @property
     def tangents(self) -> int:
@@ -203,7 +219,7 @@ class AccelerateTangents(Accelerate):
 
 @dataclass(frozen=True)
 class RunSecondTangents(RunTangents):
-    """Integrate, with the second derivatives of the states and of the end along pairs of directions."""
+    """The operation that integrates and computes second derivatives of the states, and of the end, along pairs of directions."""
 
     @property
     def tangents(self) -> int:
@@ -215,9 +231,10 @@ class RunSecondTangents(RunTangents):
 
 @dataclass(frozen=True)
 class RunCotangents(RunStates):
-    """Integrate and return a record; or, with cotangents of the states and of the end, backpropagate to all numbers.
+    """The operation of reverse mode, which a gradient calls twice.
 
-    The outputs of the other pass are empty.
+    Without cotangents, the first pass integrates and returns a record. With cotangents of the states and of the end, the second
+    pass backpropagates along the record to all numbers. Outputs that belong to the other pass are empty.
     """
 
     active: tuple[bool, ...] = ()
@@ -225,7 +242,7 @@ class RunCotangents(RunStates):
 
     @property
     def record_length(self) -> int:
-        """The length of a record that is stored."""
+        """The length of the record of one member, in numbers; 0 if records are not stored."""
         return self.points and record.record_length(self.code.coordinate_count, self.points)
 
     def module(self, width: int, tangent_lanes: int, vector: int) -> Module:
@@ -246,7 +263,7 @@ def _sliding(locks: Sequence[dict[str, Any]], **others: Any) -> Sliding:
 
 
 def goes_back(inputs: Sequence[Any]) -> bool:
-    """Return whether the inputs of reverse mode are those of its second pass, with cotangents."""
+    """Return True if the inputs of reverse mode are those of its second pass, with cotangents."""
     return inputs[-1].shape[-2] > 0
 
 

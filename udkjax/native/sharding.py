@@ -15,15 +15,16 @@ except ImportError:
 
 
 def divide_members(primitive: Primitive) -> None:
-    """Make JAX tell the devices of a program to the lowering of a primitive, which `call_by_members` needs."""
+    """Make JAX tell the lowering rule of a primitive the devices of the program, which `call_by_members` needs."""
     if _told_devices is not None:
         _told_devices.add(primitive)
 
 
 def knows_devices(context: Any) -> bool:
-    """Return whether the devices of a program are known while it is lowered.
+    """Return True if the devices of a program are known while it is lowered.
 
-    JAX looks for primitives of the set above in the program itself, not in the rules of other primitives, such as that of scales.
+    They are known only if a primitive of the set above is in the program itself; JAX does not look into the lowering rules of
+    other primitives, such as that of scales.
     """
     return getattr(context.module_context.axis_context, "device_assignment", ()) is not None
 
@@ -31,12 +32,12 @@ def knows_devices(context: Any) -> bool:
 def call_by_members(
     function: Callable[..., Sequence[Array]], inputs: Sequence[Any], shapes: Sequence[tuple[int, ...]]
 ) -> Sequence[Array]:
-    """Call a function with a rule that divides its first axis, that of members, among devices; in other programs only call it.
+    """Return the results of a function, with a rule by which XLA may divide the members among the devices of a program.
 
     Args:
-        function: of the inputs of any number of members; it computes each member alone.
-        inputs: arrays whose first axis is that of the members, or of length one if all share them.
-        shapes: of the results.
+        function: A function of arrays like `inputs`, for any number of members; the result of a member depends on it alone.
+        inputs: Arrays whose first axis is that of the members, or has length one if all members share them.
+        shapes: The shapes of the results, (members, ...).
     """
     members = shapes[0][0]
     if members == 1 or _told_devices is None:
@@ -62,7 +63,7 @@ def _of_members(mesh: Any, shape: Sequence[int], members: int, axes: Sequence[An
 
 
 def _rule(inputs: Sequence[Sequence[int]], results: Sequence[Sequence[int]], members: int) -> str:
-    """Return a sharding rule in which only the axis of members, m, occurs more than once."""
+    """Return a sharding rule for arrays of these shapes, in which all axes have different names, except those of members: m."""
     count = 0
 
     def factors(shape: Sequence[int]) -> str:

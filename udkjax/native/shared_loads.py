@@ -1,7 +1,7 @@
-"""Calls of machine code where redundant rows share the loads of joints with friction, but are known only when it is called.
+"""Calls of machine code if redundant rows share the loads of joints with friction, and these rows are known only at the call.
 
 Marks among the numbers of each member are negative for its redundant rows (equations/elimination/load_sharing.py). Members with
-the same redundant rows are run together, by machine code for these rows. Members without any, which are most, need no other code.
+the same redundant rows run together, by machine code for these rows. Most members have no redundant rows and share one code.
 """
 
 from collections.abc import Callable, Sequence
@@ -22,13 +22,13 @@ Call = Callable[..., list[np.ndarray]]
 
 
 def call_by_rows(call: Call, inputs: Sequence[np.ndarray], operation: Operation, times: int) -> list[np.ndarray]:
-    """Return the outputs of all members.
+    """Return the outputs of all members, each from machine code for its redundant rows.
 
     Args:
-        call: Runs an operation: (*inputs, operation, times) -> outputs.
-        inputs: Sequence[np.ndarray], (1 or members, ...) each.
+        call: A function that runs an operation: (*inputs, operation, times) -> outputs.
+        inputs: The inputs of the operation, (1 or members, ...) each.
         operation: The operation; its code `shares_by_marks`.
-        times: The number of times.
+        times: The number of output times.
     """
     is_shared = inputs[NUMBERS][:, operation.code.marks] < 0
     if (is_shared == is_shared[0]).all():
@@ -45,7 +45,7 @@ def call_by_rows(call: Call, inputs: Sequence[np.ndarray], operation: Operation,
 def _call_of_rows(
     call: Call, inputs: Sequence[np.ndarray], operation: Operation, times: int, is_shared: Bool[np.ndarray, "m"]
 ) -> list[np.ndarray]:
-    """Return the outputs of members with the same redundant rows."""
+    """Return the outputs of members with the same redundant rows; `is_shared` is the mask of these rows."""
     rows = tuple(np.flatnonzero(is_shared).tolist())
     with computing_on_host():  # programs are traced here, while a graphics card may wait
         own = replace(operation, code=operation.code.with_shared_rows(rows))
@@ -54,7 +54,7 @@ def _call_of_rows(
 
 @dataclass(frozen=True)
 class CallByRows:
-    """`call_by_rows` as an operation of compiled JAX programs."""
+    """`call_by_rows` for one operation, as a function that compiled JAX programs call on the host."""
 
     call: Call
     operation: Operation
@@ -69,7 +69,7 @@ class CallByRows:
         return call_by_rows(self.call, inputs, self.operation, self.times)
 
     def shapes(self, members: int) -> list[tuple[int, ...]]:
-        """Return the shapes of the outputs."""
+        """Return the shapes of the outputs of `members` members."""
         return [(members, *shape) for shape in self.of_member]
 
 
@@ -80,7 +80,7 @@ def bind_by_rows(call: Call, inputs: Sequence[Any], operation: Operation, times:
 
 
 def _with_weights(inputs: Sequence[np.ndarray], operation: Operation, shared: int) -> list[np.ndarray]:
-    """Return inputs with weights of rows instead of their marks, and with the rank without the redundant rows."""
+    """Return the inputs with weights of the rows in place of their marks, and with a rank bound lowered by `shared` rows."""
     settings, names, marks = inputs[SETTINGS].copy(), operation.all_settings, operation.code.marks
     weights = settings[:, names.index("length"), None] / inputs[ROWS]
     numbers = np.broadcast_to(inputs[NUMBERS], (max(len(inputs[NUMBERS]), len(weights)), inputs[NUMBERS].shape[1])).copy()

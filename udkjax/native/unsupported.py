@@ -10,9 +10,9 @@ from udkjax.programs.identity_cache import cached_by_identity
 
 @cached_by_identity
 def unsupported(code: RunPrograms) -> str:
-    """Return the unsupported operations of a scene; empty if there are none.
+    """Return a message that names an operation of a scene's programs without machine code; "" if all of them have machine code.
 
-    Only operations that are not arithmetic are looked at, once for each kernel: nothing is written that is written again later.
+    Only operations that are not arithmetic are checked, once for each kernel of the programs.
     """
     names = ("accelerations", "newton_v_and_psi", *(["pieces"] if code.piece_count else []))
     programs = [code.prologue, *(code.of(*PROGRAMS[name].outputs) for name in names)]

@@ -1,6 +1,6 @@
-"""Modules of the engine as C99: the same text as machine code, for processors without Python.
+"""Modules of the engine as C99, translated from the same text as machine code, for processors without Python.
 
-`c_unit` makes the C of an operation for one member, whose memory the caller gives; `c_function` translates one function.
+`c_unit` returns the C of an operation on one member, in memory that its caller provides; `c_function` translates one function.
 """
 
 from udkjax.native.c.syntax import number_text

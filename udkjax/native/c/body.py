@@ -1,4 +1,4 @@
-"""The body of a function in C: lines, variables and blocks."""
+"""The body of a function in C: its lines, variables and blocks."""
 
 import re
 from collections import Counter
@@ -12,14 +12,22 @@ LONGEST = 90  # characters of an expression: a longer one gets a name
 
 
 class FunctionBody(Instructions):
-    """The body of one function."""
+    """The translation of one function of LLVM's text to C.
+
+    Results that are used once wait in `_pending`, until they become part of the expression that uses them.
+
+    Args:
+        f: The function.
+        functions: All functions of the unit, by name.
+        names: The names of places in memory.
+    """
 
     def __init__(self, f: FunctionText, functions: Mapping[str, FunctionText], names: Names):
         self._f, self._functions, self._names = f, functions, names
         self._hoisted: dict[str, str] = {}
 
     def text(self) -> str:
-        """Return the definition of the function."""
+        """Return the definition of the function in C."""
         self._f.lines = without_dead(self._f.lines)
         while True:
             count = len(self._hoisted)
@@ -65,7 +73,7 @@ class FunctionBody(Instructions):
         self._emit("}")
 
     def _flush(self, changed: str | None = None):
-        """Name the waiting expressions that depend on what changes; all if None."""
+        """Assign the pending expressions that read `changed`, a variable or "memory", to names of C; all of them if None."""
         for name in [n for n, e in self._pending.items() if changed is None or changed in e.reads]:
             self._name(name, self._pending.pop(name))
 
@@ -79,7 +87,7 @@ class FunctionBody(Instructions):
             self._emit(f"{kind if kind.startswith('const ') else kind if e.kind == 'ptr' else f'const {kind}'}{name} = {e.text};")
 
     def _value(self, text: str, kind: str) -> CExpression:
-        """Return an operand."""
+        """Return an operand of LLVM's text, of the type `kind`, as an expression of C; it is no longer pending."""
         text = text.strip()
         if text.startswith("<"):
             text = text[1:].split(",")[0].split()[-1]
@@ -184,13 +192,13 @@ class FunctionBody(Instructions):
 
 
 def right_side(line: str) -> str:
-    """Return the part of a line that uses values."""
+    """Return the part of a line of LLVM's text that uses values: all of it, or the part after the name of the result."""
     match = re.match(r"%[\w.]+ = (.*)", line)
     return match[1] if match else line
 
 
 def without_dead(lines: list[str]) -> list[str]:
-    """Return the lines without results that nothing uses, and without variables that nothing reads."""
+    """Return the lines of LLVM's text, except those for results that no line uses and for variables that no line reads."""
     while True:
         uses = Counter(x for line in lines for x in re.findall(r"%([\w.]+)", right_side(line)))
         stored = {x for line in lines if (m := re.match(r"store .*, ptr %([\w.]+)(?:, align \d+)?$", line)) for x in [m[1]]}

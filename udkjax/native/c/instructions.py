@@ -12,7 +12,7 @@ INTRINSICS = {"fmuladd": "FMA", "maximum": "maximum", "minimum": "minimum", "rou
 
 
 class Instructions:
-    """Each method returns the expression of one kind of instruction."""
+    """Translations of instructions: the method `_x` returns the expression of C for an instruction `x` of LLVM's text."""
 
     _f: FunctionText
     _functions: Mapping[str, FunctionText]
@@ -20,7 +20,7 @@ class Instructions:
     _slots: dict[str, str]
 
     def _value(self, text: str, kind: str) -> CExpression:
-        """Return an operand."""
+        """Return an operand of LLVM's text, of the type `kind`, as an expression of C."""
         raise NotImplementedError
 
     def _load(self, text: str) -> CExpression:

@@ -7,7 +7,12 @@ from dataclasses import dataclass
 
 @dataclass
 class Names:
-    """The names of places in the memory of a module, for readers: arrays by their first number, and fields of the call record."""
+    """The names that indices in the memory of a run and in its call record have in C, for readers.
+
+    Attributes:
+        places: The index of the first number of each array in the memory.
+        fields: The names of the fields of the call record, in their order.
+    """
 
     places: Mapping[str, int]
     fields: Sequence[str]
@@ -16,7 +21,7 @@ class Names:
         self._starts = sorted((start, name) for name, start in self.places.items())
 
     def index(self, pointer: str, index: str) -> str:
-        """Return an index, by name where a constant tells which array it is in."""
+        """Return the expression of an index at a pointer, in which the constant that selects an array or a field has a name."""
         head, plus, rest = index.rpartition(" + ")
         if not re.fullmatch(r"\d+", rest):
             return index
@@ -31,7 +36,7 @@ class Names:
         return f"{head}{plus}{identifier(name)}{f' + {number - start}' if number > start else ''}"
 
     def text(self, meanings: Mapping[str, str], used: str) -> str:
-        """Return the definitions of the names that are used."""
+        """Return C definitions of the names that the text `used` contains, with `meanings` as comments; "" if there are none."""
         words = set(re.findall(r"\b[A-Z][A-Z0-9_]*\b", used))
         lines = [
             f"    {identifier(name)} = {start},{f' /* {meanings[name]} */' if name in meanings else ''}"
@@ -47,5 +52,5 @@ class Names:
 
 
 def identifier(name: str) -> str:
-    """Return the name of a constant of C."""
+    """Return the name in C of the constant for an array or a field."""
     return re.sub(r"\W", "_", name).upper()

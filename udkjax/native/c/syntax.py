@@ -24,7 +24,14 @@ class FunctionText:
 
 @dataclass
 class CExpression:
-    """An expression that is written where it is used, and the variables on which it depends."""
+    """An expression of C.
+
+    Attributes:
+        text: The expression.
+        kind: The type of its value in LLVM's text.
+        reads: The variables on which it depends, and "memory" if it loads a number.
+        element: For an address, the type of the numbers there; "table" for a table of constants.
+    """
 
     text: str
     kind: str
@@ -33,18 +40,18 @@ class CExpression:
 
 
 def pointer_type(element: str) -> str:
-    """Return the type of addresses of numbers; tables and the call record are constant."""
+    """Return the type in C of addresses of numbers of the type `element`; tables (i32) and the call record (i64) are const."""
     return f"{'const ' if element in ('i32', 'i64') else ''}{TYPES[element]} *"
 
 
 def function_head(f: FunctionText) -> str:
-    """Return the head of a function's definition."""
+    """Return the head of a function's definition in C: the type of its result, its name and its arguments."""
     arguments = [f"{pointer_type(f.elements[n])}{n}" if kind == "ptr" else f"{TYPES[kind]} {n}" for kind, n in f.arguments]
     return f"{'void' if f.returns == 'void' else TYPES[f.returns]} {f.name}({', '.join(arguments)})"
 
 
 def literal(text: str, kind: str) -> str:
-    """Return a constant of LLVM's text in C."""
+    """Return a constant of LLVM's text, of the type `kind`, in C."""
     if text in ("poison", "undef", "zeroinitializer"):
         return "0"
     if text in ("true", "false"):
@@ -60,7 +67,7 @@ def literal(text: str, kind: str) -> str:
 
 
 def number_text(number: float) -> str:
-    """Return a number in C, exactly."""
+    """Return a number as a constant of C that has exactly the same value."""
     if number != number:
         return "NAN"
     if abs(number) == float("inf"):
@@ -69,14 +76,14 @@ def number_text(number: float) -> str:
 
 
 def operand(text: str) -> str:
-    """Return an expression as an operand."""
+    """Return an expression of C in parentheses, unless it needs none as an operand."""
     if re.fullmatch(r"[\w.]+|\w+\([^()]*\)|\w+\[[^\[\]]*\]", text) or _is_call(text):
         return text
     return f"({text})"
 
 
 def array_and_index(address: str) -> tuple[str, str]:
-    """Return the parts of `&array[index]`."""
+    """Return the array and the index of an address `&array[index]`."""
     depth = 0
     for k in range(len(address) - 1, 0, -1):
         depth += (address[k] == "]") - (address[k] == "[")
@@ -86,7 +93,7 @@ def array_and_index(address: str) -> tuple[str, str]:
 
 
 def _is_call(text: str) -> bool:
-    """Return True for a call or an entry as a whole: its brackets close at the end."""
+    """Return True if a text is one call or one entry of an array: its first bracket closes at the end."""
     match = re.match(r"\w+[(\[]", text)
     if not match:
         return False
@@ -99,5 +106,5 @@ def _is_call(text: str) -> bool:
 
 
 def number_at(e: CExpression) -> str:
-    """Return the number at an address."""
+    """Return the expression of C for the number at an address."""
     return e.text[1:] if e.text.startswith("&") else f"*{operand(e.text)}" if not re.fullmatch(r"\w+", e.text) else f"{e.text}[0]"

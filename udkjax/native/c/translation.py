@@ -48,8 +48,8 @@ def translated(text: str, entry: str, names: Names, meanings: Mapping[str, str] 
     Args:
         text: LLVM's text of the module, of one lane.
         entry: the name of the function.
-        names: names of places in memory.
-        meanings: comments on places.
+        names: the names of places in memory and of fields of the call record.
+        meanings: comments on places, by the names of arrays.
     """
     functions = {f.name: f for f in _functions(text)}
     order = _reachable(functions, entry)
@@ -66,7 +66,7 @@ def translated(text: str, entry: str, names: Names, meanings: Mapping[str, str] 
 
 
 def helpers(text: str) -> str:
-    """Return the definitions of helping functions that a text uses."""
+    """Return the definitions of the `HELPERS` that a text in C calls, and of those that they need."""
     used = {name for name in HELPERS if re.search(rf"\b{name}\(", text)}
     used |= {NEEDED[name] for name in used if name in NEEDED}
     return "\n".join(f"static {definition}" for name, definition in HELPERS.items() if name in used)
@@ -81,7 +81,7 @@ def _functions(text: str) -> Iterable[FunctionText]:
 
 
 def _reachable(functions: Mapping[str, FunctionText], entry: str) -> list[str]:
-    """Return the functions that `entry` calls, in the order of the text."""
+    """Return the names of `entry` and of all functions that it calls, also indirectly, in the order of the text."""
     found, waiting = {entry}, [entry]
     while waiting:
         new = {x for x in functions[waiting.pop()].called if x in functions} - found
@@ -91,7 +91,7 @@ def _reachable(functions: Mapping[str, FunctionText], entry: str) -> list[str]:
 
 
 def _find_elements(functions: Mapping[str, FunctionText]):
-    """Find the types of numbers to which arguments point: those by which the functions address them."""
+    """Set `elements` of all functions: the types of the numbers to which arguments point, which their addresses tell."""
     for f in functions.values():
         for kind, name in f.arguments:
             if kind == "ptr":
@@ -102,7 +102,7 @@ def _find_elements(functions: Mapping[str, FunctionText]):
 
 
 def _table(line: str) -> tuple[str, str]:
-    """Return the name and the definition of a table of constants."""
+    """Return the name and the definition in C of a table of constants, from its line of LLVM's text."""
     name = re.match(r"@(\w+)", line)
     assert name
     if data := re.search(r'x i8\] c"(.*)"', line):

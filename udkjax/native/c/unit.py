@@ -1,4 +1,4 @@
-"""The C of one operation, as a thread of a GPU runs it: one member, in memory that its caller gives."""
+"""The C of one operation on one member, in memory that the caller provides, as a thread of a GPU runs it."""
 
 import re
 from collections.abc import Mapping
@@ -32,8 +32,9 @@ class CUnit:
     Attributes:
         text: the C.
         module: the module, which describes the call record.
-        memory: count of numbers in the memory of a run.
-        flops: operations of each function, of both branches of each `if`, and of one pass of loops of unknown length.
+        memory: the number of float64 numbers in the memory of a run.
+        flops: the number of floating-point operations of each function: of both branches of each `if`, and of one pass of loops
+            of unknown length.
     """
 
     text: str
@@ -42,7 +43,11 @@ class CUnit:
     flops: Mapping[str, int]
 
     def call_record(self, values: Mapping[str, str]) -> str:
-        """Return statements of C that make the call record of one member; `values` are expressions by the names of its fields."""
+        """Return statements of C that define the call record `call` of one member.
+
+        `values` are expressions of C for fields, by name. Other fields are zero, except the numbers of members and directions,
+        which are one, and `next`.
+        """
         known = {name: k for k, name in enumerate(self.module.call_fields)}
         lines = [f"    int64_t next[2] = {{0, 0}}, call[{len(known)}] = {{0}};"]
         for name, value in ({"members": "1", "directions": "1", "next": "next"} | dict(values)).items():
@@ -52,14 +57,14 @@ class CUnit:
 
 
 def c_unit(operation: Operation, directions: int = 0) -> CUnit:
-    """Translate an operation.
+    """Translate an operation to C.
 
     Args:
         operation: an operation of `native.operations`.
         directions: the largest number of directions of its tangents.
 
     Returns:
-        Its C.
+        The C of the operation.
 
     Raises:
         UnsupportedError: machine code does not support the operation.
@@ -78,17 +83,17 @@ def c_unit(operation: Operation, directions: int = 0) -> CUnit:
 
 
 def c_function(function: Function) -> str:
-    """Translate one function of addresses of numbers, with the functions that it evaluates."""
+    """Return the C of one function, whose arguments are addresses of numbers, with the functions that it evaluates."""
     return translated(text_of_module([function]), function.name, Names({}, ()))
 
 
 def count_operations(text: str) -> dict[str, int]:
-    """Count the operations on numbers of each function of a module and of the functions that it calls."""
+    """Return the number of floating-point operations of each function of a module, with those of the functions that it calls."""
     bodies = {m[1]: m[2].split("\n") for m in re.finditer(r"^define [^@]*@(\w+)\([^{]*\{\n(.*?)\n\}", text, re.M | re.S)}
 
     @cache
     def count(name: str, length: int = 1) -> int:
-        """Count the operations of a function whose loops over `count` have this length."""
+        """Return the number of operations of a function whose loops over its argument `count` have this length."""
         total, factors, lines = 0, [1], bodies[name]
         for k, line in enumerate(lines):
             line = line.strip()

@@ -12,11 +12,11 @@ from udkjax.native.language.text import text_of_module
 
 
 class BatchProgram:
-    """A program of scalars, evaluated for M members on the calling thread.
+    """A program of scalars, compiled, and evaluated for M members on the calling thread.
 
     Args:
-        program: its first inputs differ between members.
-        shared: number of inputs, the last ones, that are the same for all members.
+        program: the program. Its first inputs differ between members, its last ones may be shared.
+        shared: the number of its last inputs that are the same for all members.
     """
 
     def __init__(self, program: ScalarProgram, shared: int = 0):
@@ -27,7 +27,7 @@ class BatchProgram:
         self._run = machine.function(self._library[f.name], *[ctypes.c_void_p] * 3, ctypes.c_int64)
 
     def __call__(self, members: np.ndarray, shared: np.ndarray | None = None) -> np.ndarray:
-        """Return the outputs (outputs, M) for inputs (inputs, M) and shared inputs."""
+        """Return the outputs (outputs, M) for the inputs of members (inputs, M) and the shared inputs (shared,)."""
         count = members.shape[1]
         padded = -(-count // self.width) * self.width
         inputs = np.empty((self._input_count, padded))

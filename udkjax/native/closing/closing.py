@@ -61,7 +61,7 @@ class Closing(Module):
         n, m = self.n, self.m
 
         def size() -> Value:
-            """Return |Psi|, each row over its scale; NaN if any row is NaN."""
+            """Return the norm of Psi at the state, each row divided by its scale; NaN if any row is NaN."""
             self.invoke(f, "psi")
             total = f.variable(0.0)
             with f.each(m) as i:
@@ -132,16 +132,16 @@ class Closing(Module):
         self._finish_closing(f, member)
 
     def _evaluate(self, f: Function, x: str):
-        """Evaluate a correction of q or v at the state, with the intermediate results that derivatives need."""
+        """Evaluate a correction of q or v (`x`) at the state, with the intermediate results that derivatives need."""
         f.call(f"evaluation_newton_{x}", f.given["work"], f.given["work"], self.address(f, "correction"))
 
     def change(self, f: Function, x: str, i: Value) -> Value:
-        """Return a coordinate of the unlimited correction."""
+        """Return coordinate i of the latest correction of q or v (`x`), before its length is limited."""
         place = self.places["correction"] + self.corrections[x].place(f"{x}1")
         return f.load(f.given["work"], i + place) - self.entry(f, f"state {x}", i)
 
     def _correct(self, f: Function, x: str):
-        """Compute the unlimited correction of q or v as `state dq` or `state dv`."""
+        """Compute the correction of q or v (`x`) at the state as `state dq` or `state dv`, before its length is limited."""
         self._evaluate(f, x)
         with f.each(self.n) as i:
             self.put_entry(f, f"state d{x}", i, self.change(f, x, i))
@@ -149,13 +149,16 @@ class Closing(Module):
     # --- hooks for derivatives (closing_derivatives.py)
 
     def _record_correction(self, f: Function, x: str, scale: Value, limited: Value):
-        """Hook: called at the state before each correction with its `scale`; `limited` is one if it limits the length."""
+        """Hook: add code at the state before each correction of q or v (`x`). Does nothing by default.
+
+        `scale`: the factor of the correction; `limited`: one if this factor limits the length of the step, else zero.
+        """
 
     def _finish_closing(self, f: Function, member: Value):
-        """Hook: called when a member has been closed."""
+        """Hook: add code after a member has been closed and its results have been written. Does nothing by default."""
 
     def _at_previous_state(self, f: Function, x: str, do: Callable[[], None]):
-        """Run `do` at the state before a step, which is in `corrected q`, instead of the state after it."""
+        """Run `do` at the state before a step, which is in `corrected q`, and return to the state after it."""
         with f.each(self.n) as i:
             current, before = self.entry(f, f"state {x}", i), self.entry(f, "corrected q", i)
             self.put_entry(f, "corrected q", i, current)

@@ -69,7 +69,10 @@ class ClosingForward(ClosingDerivative):
         return self.address(f, "correction")
 
     def _write_push(self, x: str):
-        """Write push_x(work, scale, limited): the tangents of a correction times `scale`, which may be `limited`."""
+        """Write `push_<x>(work, scale, limited)`: add `scale` times the tangents of a correction to the tangents of the state.
+
+        If `limited` is one, the factor limits the length of the step, and has tangents itself.
+        """
         f, _ = self.function(f"push_{x}", [(POINTER, "work"), (DOUBLE, "scale"), (DOUBLE, "limited")])
         stored = self._linearize(f, x)
         longest, which = self._longest(f, x)
@@ -88,12 +91,16 @@ class ClosingForward(ClosingDerivative):
                     self._increase(f, f"state {x}", i, f.given["scale"] * step, way)
 
     def _limited(self, steps: dict[str, Value], shares: dict[str, Value], step: Value) -> dict[str, Value]:
-        """Return the tangents of a coordinate of a limited step c / c_j, times c_j: dc - a c, with a = dc_j / c_j."""
+        """Return the tangents of a coordinate c of a limited step, by way.
+
+        The step is proportional to c / c_j, with c_j the longest coordinate; c_j times its tangents is dc - a c, with the
+        `shares` a = dc_j / c_j, which are zero if the step is not limited. `steps` are the dc, and `step` is c.
+        """
         return {way: change - shares[way] * step for way, change in steps.items()}
 
     @contextmanager
     def _each_direction(self, f: Function) -> Iterator[Value]:
-        """Run the block for every direction; the tangents' addresses become arguments of the function, by name."""
+        """Run the block for every direction, with its index; `f.given` has the addresses of its tangents, by way."""
         first = self.first_tangent(f)
         with f.each(self.field(f, "directions")) as p:
             for k, way in enumerate(self.ways):
@@ -190,7 +197,10 @@ class ClosingReverse(ClosingDerivative):
             self._write_pull(x)
 
     def _write_pull(self, x: str):
-        """Write pull_x(work, scale, limited): pull `bar iterate` back through a correction at the state."""
+        """Write `pull_<x>(work, scale, limited)`: pull `bar iterate` back through a correction at the state.
+
+        The arguments are those of `_record_correction`.
+        """
         f, _ = self.function(f"pull_{x}", [(POINTER, "work"), (DOUBLE, "scale"), (DOUBLE, "limited")])
         self._evaluate(f, x)
         self.corrections[x].prepare_derivative(f)
@@ -208,7 +218,10 @@ class ClosingReverse(ClosingDerivative):
         self._accumulate(f)
 
     def _accumulate(self, f: Function):
-        """Add the cotangents in `bar state` from the derivative of a correction."""
+        """Add the cotangents that a correction has pulled back, `bar state` and `bar constants`, to the sums.
+
+        The sums are `bar iterate` and `total bar constants`.
+        """
         with f.each(self.constants) as i:
             self._increase(f, "total bar constants", i, self.entry(f, "bar constants", i))
         with f.each(self.n) as i:

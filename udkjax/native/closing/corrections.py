@@ -27,7 +27,7 @@ from udkjax.native.pseudoinverses.weighted_rows import WeightedRows
 
 
 class EliminationCorrection(ProgramDerivative):
-    """A correction by elimination."""
+    """A correction of q or v by elimination, with its derivatives."""
 
     def write_adjoint(self):
         """Do nothing: the evaluation already stores all intermediate results."""
@@ -45,9 +45,9 @@ class EliminationCorrection(ProgramDerivative):
 
 
 class LeastNormCorrection:
-    """A correction by singular values, for one lane. It stores the corrected x, z and y.
+    """A correction of x = q or v by singular values, for one lane, with its derivatives.
 
-    Derivatives at the same state use the factors of A from the evaluation.
+    An evaluation stores the corrected x, z and y. Derivatives at the same state use the factors of A from the evaluation.
     """
 
     def __init__(self, module: Module, name: str, rows: WeightedRows):
@@ -91,7 +91,7 @@ class LeastNormCorrection:
         return self._rows.array(f, "weights", i)
 
     def evaluation(self):
-        """Write `evaluation_...(work, out, stored)`: the correction and z, with the rank."""
+        """Write `evaluation_<name>(work, out, stored)`: compute the corrected x and z at `stored`, and set `rank`."""
         module = self._module
         module.loops.write(self._program, f"rows_{self._x}", ("work", "out"), self._arrays)
         f, s = module.function(f"evaluation_{self._name}", [(POINTER, "work"), (POINTER, "out"), (POINTER, "stored")])
@@ -104,7 +104,7 @@ class LeastNormCorrection:
             f.store(self._at(f, f"state {self._x}", i) - self._at(f, "root", i) * z.entry(i), f.given["stored"], i)
 
     def write_adjoint(self):
-        """Write `adjoint_...(work, stored)`: compute y, which only derivatives need."""
+        """Write `adjoint_<name>(work, stored)`: compute y, which only derivatives need."""
         f, _ = self._module.function(f"adjoint_{self._name}", [(POINTER, "work"), (POINTER, "stored")])
         x = self._rows.matrices(f).row("x")
         x.clear()
@@ -119,7 +119,7 @@ class LeastNormCorrection:
         f.call(f"adjoint_{self._name}", f.given["work"], self._module.address(f, "correction"))
 
     def forward(self):
-        """Write `forward_...(work, stored, tangent, out)`: the tangent of the correction along one direction."""
+        """Write `forward_<name>(work, stored, tangent, out)`: compute the tangent of the corrected x along one direction."""
         module, w = self._module, self._module.tangents
         at = self._arrays | self._changes(TANGENT)
         places = {"constants": "constants", "q": "state q", "v": "state v"}
@@ -152,7 +152,7 @@ class LeastNormCorrection:
             f.store(before - change, f.given["tangent"], i + w[f"result {self._x}"])
 
     def reverse(self):
-        """Write `reverse_...(work, stored, bar)`: from cotangents of the correction to those of the state and the constants."""
+        """Write `reverse_<name>(work, stored, bar)`: pull cotangents of the corrected x back to the state and the constants."""
         module, p = self._module, self._module.places
         bars = {"constants": "bar constants", "q": "bar state q", "v": "bar state v"}
         at = self._arrays | self._changes(COTANGENT)

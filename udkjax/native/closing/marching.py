@@ -41,7 +41,7 @@ LENGTHENING = 1.5  # below 2, so that a step which had to be halved is not tried
 
 
 class _Going:
-    """The variables of each lane that follows positions."""
+    """The variables of the lanes in the function `march`, one number for each lane except in `begins`."""
 
     def __init__(self, f: Function, s: Lane):
         self.good = f.variable(s.active)  # whether all positions so far are sound
@@ -53,7 +53,7 @@ class _Going:
         self.begins = f.variable(0.0, width=1)  # whether no step has been tried
 
     def tries(self, target: Value) -> Value:
-        """Return the lanes that have not reached the target."""
+        """Return the lanes that have not reached the target value, and whose positions so far are sound."""
         return (self.good.value > 0.5) & (self.value.value.is_not(target) | (self.begins.value > 0.5))
 
 
@@ -123,7 +123,7 @@ class Marching(Module):
                 f.store(f.lane(x.value, lane), self.field(f, name, POINTER), member)
 
     def _try_step(self, f: Function, s: Lane, going: _Going):
-        """Try one step towards `next` in the lanes that have not got there."""
+        """Try one step towards the value `next` in the lanes that have not reached it."""
         one, zero, tries = f.const(1.0, DOUBLE, f.width), f.const(0.0, DOUBLE, f.width), going.tries(s.next)
         begins = going.begins.value > 0.5
         begins = f.repeat(begins, f.width)
@@ -156,7 +156,7 @@ class Marching(Module):
         going.begins.value = 0.0
 
     def _step_on(self, f: Function, h: Value):
-        """Predict the next positions, correct them, and compute their q' and q''."""
+        """Predict the positions after a step `h` of the value, correct them at `state t`, and compute their q' and q''."""
         with f.each(self.n) as i:
             first, second = self.entry(f, "result dq", i), self.entry(f, "result dv", i)
             curvature = f.fma(h * (1 / 6), self.entry(f, "third derivative", i), second * 0.5)
@@ -180,7 +180,7 @@ class Marching(Module):
         self.invoke(f, "value_derivatives")
 
     def _side(self, f: Function) -> Value:
-        """Return the sign of det Psi_q at `state q`; 1 if Psi_q is not square."""
+        """Return the sign of det Psi_q at `state q`; 1 if the rows are not as many as the coordinates."""
         if not self._rows:
             return f.const(1.0, DOUBLE, f.width)
         self.invoke(f, "dense_newton_q")
@@ -188,7 +188,10 @@ class Marching(Module):
         return _METHOD.sign(self._rows.matrices(f))
 
     def _is_sound(self, f: Function, s: Lane, h: Value, begins: Value) -> tuple[Value, Value, Value]:
-        """Return whether positions are sound, and the lengths of arc per value before and after the step."""
+        """Return the lanes whose new positions are sound, and the lengths of arc per unit of the value before and after the step.
+
+        `h`: the step of the value; `begins`: the lanes at their first position, which has no prediction.
+        """
         one, eps = f.const(1.0, DOUBLE, f.width), float(np.finfo(float).eps)
         deviation, largest = f.variable(0.0), f.variable(1.0)
         product, old_square, new_square = f.variable(0.0), f.variable(0.0), f.variable(0.0)
@@ -209,7 +212,11 @@ class Marching(Module):
         return is_closed & self._has_digits(f, s, new_rate) & is_smooth, old_rate, new_rate
 
     def _has_digits(self, f: Function, s: Lane, arc_rate: Value) -> Value:
-        """Return whether enough digits of q'' are correct: near dependent rows by the distances here and a little farther on."""
+        """Return the lanes in which enough digits of q'' are correct.
+
+        Near dependent rows, the distances from these here and a little farther on decide. `arc_rate`: the length of arc per unit
+        of the value.
+        """
         rule, here, now = CLOSURE.digits, s.distance, getattr(s, "state t")
         is_clear, result = here > rule.clear, f.variable(0.0)
         result.where(is_clear, 1.0)

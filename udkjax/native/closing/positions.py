@@ -47,7 +47,7 @@ class Positions(NamedTuple):
 
 
 class PositionCode:
-    """The machine code of position programs."""
+    """The compiled machine code of position programs; a call computes a batch of positions."""
 
     def __init__(self, programs: PositionPrograms):
         self.programs, self.width = programs, processor.lanes()
@@ -64,10 +64,10 @@ class PositionCode:
         longest: float = np.inf,
         threads: int | None = None,
     ) -> Positions:
-        """Close and measure positions.
+        """Close the positions of a batch, and evaluate the outputs of the programs there.
 
         Args:
-            x: Free numbers (M, P).
+            x: Free numbers of each member (M, P).
             s: Values of the driver, for all members (J,) or for each (M, J).
             unit: Units of the coordinates (n,), in which corrections are measured.
             data: Data of the positions, for all members (J, D) or for each (M, J, D).
@@ -104,7 +104,7 @@ class PositionCode:
 
 
 class _Text:
-    """LLVM's text of the code."""
+    """The writer of LLVM's text of the code."""
 
     def __init__(self, programs: PositionPrograms, width: int):
         self.programs, self.width = programs, width
@@ -149,7 +149,7 @@ class _Text:
         return f.load(f.given["call"], FIELDS.index(name), base=base)
 
     def _gather(self, f: Function, addresses: Sequence[Value], name: str, count: int):
-        """Load `count` numbers from the address of each lane into an array."""
+        """Load `count` numbers for each lane, from the address of that lane, into the array `name`."""
         with f.each(count) as i:
             for k, address in enumerate(addresses):
                 f.store(f.load(address, i), f.given["work"], (i + self.places[name]) * self.width + k)
@@ -165,7 +165,10 @@ class _Text:
     # --- functions
 
     def _close(self) -> Function:
-        """Write `close(work, most)`: q by Newton's method at s; `end` becomes the last step, or NaN if it fails."""
+        """Write `close(work, most)`: compute q at s by Newton's method, with steps shorter than `most`.
+
+        `end` becomes the length of the last Newton step, or NaN if the method fails.
+        """
         arguments = [(POINTER, "work"), (DOUBLE, "most")]
         f, n = Function("close", arguments, self.width), self.programs.sizes.coordinates
         most = f.given["most"]
@@ -210,7 +213,7 @@ class _Text:
 
     @contextmanager
     def _groups(self, f: Function, members: Value) -> Iterator[Value]:
-        """Run the block for groups of members, which threads take in turn."""
+        """Run the block for each group of members, with the index of its first member; threads take groups in turn."""
         next_member = self._field(f, "next", POINTER)
         first = f.variable(0, INT, 1)
 
@@ -259,7 +262,10 @@ class _Text:
         f.call("close", f.given["work"], f.const(LONGEST_CORRECTION))
 
     def _march(self, f: Function, before: Variable, sign: Variable, longest: Variable):
-        """Continue to the target, in steps that are halved if a lane fails, and doubled if none does."""
+        """Continue to the value `target`, in steps that are halved if a lane fails, and doubled if none does.
+
+        The variables keep the previous step (`before`), the sign of the determinant at the drawn position, and the longest step.
+        """
         n, goes_on = self.programs.sizes.coordinates, f.variable(1.0, width=1)
         limit = self._field(f, "longest", DOUBLE)
 
@@ -303,7 +309,10 @@ class _Text:
         self._put(f, "s", self._load(f, "target"))
 
     def _predict(self, f: Function, step: Value, before: Value):
-        """Extrapolate the cubic through the last two positions and their rates; in the first step, use the rate alone."""
+        """Predict q after a step of s by the cubic through the last two positions and their rates, or by the last rate alone.
+
+        `before`: the previous step of s; zero if there is none.
+        """
         has_previous = (f.abs(before) > 0.0) & (f.abs(before) * FARTHEST >= f.abs(step))
         u = f.select(has_previous, step / f.select(has_previous, before, 1.0), 0.0) + 1.0
         u2, u3 = u * u, u * u * u

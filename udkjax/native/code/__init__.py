@@ -1,4 +1,5 @@
-"""From text to code: compiled for a processor, in parallel, cached on disk under a digest of the text, and interrupted by Ctrl-C.
+"""Machine code from LLVM's text: compiled in parallel for a processor, cached on disk under a digest of the text, and loaded.
 
-Only these modules call LLVM and touch the cache. Changing the text of a module needs no change here.
+Runs of this code can be interrupted by Ctrl-C. Only these modules call LLVM and touch the cache. Changing the text of a module
+needs no change here.
 """

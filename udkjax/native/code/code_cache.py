@@ -1,8 +1,9 @@
 """The cache of machine code on disk.
 
-Object code is stored under a digest of the text, the processor and the compiler, with a digest of this name and the code: a file
-that is incomplete, or belongs to another name, is ignored. So are folders and files of other users (except root), and those that
-others may write: stored code is executed. The least recently used files are deleted when the total size exceeds a limit.
+The name of a file is a digest of the text, the processor and the compiler. The file begins with a digest of this name and the
+object code: a file that is incomplete, or belongs to another name, is ignored. So are folders and files of other users (except
+root), and those that others may write: stored code is executed. The least recently used files are deleted when the total size
+exceeds a limit.
 """
 
 import hashlib
@@ -25,7 +26,11 @@ _READING = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 
 
 
 def cache_folder() -> Path | None:
-    """Return the folder of stored code, `UDKJAX_CACHE` or the user's cache folder; None without a home, or for "0"."""
+    """Return the folder of stored code: the environment variable `UDKJAX_CACHE`, else the user's cache folder.
+
+    Returns:
+        The folder, which need not exist yet; None if no code is stored, because the variable is "0" or the user has no home.
+    """
     choice = os.environ.get("UDKJAX_CACHE", "").strip()
     if choice == "0":
         return None
@@ -37,7 +42,7 @@ def cache_folder() -> Path | None:
 
 
 def cached_files() -> list[tuple[float, int, Path]]:
-    """List the time of last use, the size in bytes and the path of each file."""
+    """Return the time of last use (s since 1970), the size in bytes and the path of each file in the cache, in any order."""
     folder, files = cache_folder(), []
     try:
         for file in folder.iterdir() if folder else ():
@@ -51,7 +56,7 @@ def cached_files() -> list[tuple[float, int, Path]]:
 
 
 def read(name: str) -> bytes | None:
-    """Return the stored code of this name; None if the file is missing or incomplete, or cannot be trusted."""
+    """Return the object code stored under a name; None if its file is missing or incomplete, or cannot be trusted."""
     folder = cache_folder()
     if folder is None or refusal(folder):
         return None
@@ -64,12 +69,12 @@ def read(name: str) -> bytes | None:
 
 
 def _head(name: str, code: bytes) -> bytes:
-    """Return the first bytes of the file with the code of a name."""
+    """Return the first bytes of the file that stores some code under a name: a mark of the format, and a digest of both."""
     return _MAGIC + hashlib.sha256(name.encode() + b"\0" + code).digest()
 
 
 def _read_own(path: Path) -> bytes:
-    """Return the content of a regular file of this user that others may not write; nothing of any other file."""
+    """Return the content of a file; b"" unless it is a regular file of this user (or root) that others may not write."""
     handle = os.open(path, _READING)
     try:
         status = os.fstat(handle)
@@ -92,7 +97,7 @@ def _touch(file: Path, last: float) -> None:
 
 
 def write(name: str, code: bytes) -> None:
-    """Store code atomically, as other processes may read it meanwhile."""
+    """Store code under a name, atomically, as other processes may read it meanwhile; do nothing if there is no writable cache."""
     folder = cache_folder()
     if folder is None or refusal(folder):
         return
@@ -116,7 +121,7 @@ _writes = itertools.count()  # of this process
 
 
 def evict(most: int) -> None:
-    """Delete the least recently used files above a limit of their total size (bytes)."""
+    """Delete the least recently used files until the total size of all files is at most `most` bytes."""
     files = sorted(cached_files())
     excess = sum(size for _, size, _ in files) - most
     for _, size, file in files:

@@ -35,7 +35,7 @@ define void @on_interrupt(i32 %signal) {
 
 
 class _Handler:
-    """The handler, which stays loaded as long as the process runs."""
+    """The handler of SIGINT as machine code, which stays loaded as long as the process runs."""
 
     def __init__(self):
         self._library = machine.library(_HANDLER, ("record", "previous", "on_interrupt"))
@@ -48,7 +48,7 @@ class _Handler:
         ctypes.c_void_p.from_address(self.record + 8).value = ctypes.cast(self._install, ctypes.c_void_p).value
 
     def install(self) -> None:
-        """Put the handler before Python's, unless another has replaced that."""
+        """Replace Python's handler of SIGINT by this one, which calls Python's; leave any other handler in its place."""
         current = self._get(signal.SIGINT)
         if current == self._address or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
             return
@@ -59,12 +59,12 @@ class _Handler:
 
 @cache
 def handler() -> _Handler:
-    """Return the handler, which a call of `install` lets end runs."""
+    """Return the handler of this process, loaded in the first call; signals end runs once it is installed."""
     return _Handler()
 
 
 def connect(library: machine.Library) -> None:
-    """Let the runs of a module be interrupted."""
+    """Install the handler, and connect a loaded module with it, so that Ctrl-C ends the runs of the module."""
     handler().install()
     ctypes.c_void_p.from_address(library[POINTER_NAME]).value = handler().record
 
@@ -73,7 +73,7 @@ def connect(library: machine.Library) -> None:
 
 
 class Interruption:
-    """The check of a run, before each step, for signals since its start."""
+    """The code in `run` that checks before each step for signals since the start of the run."""
 
     def __init__(self, f: Function):
         self._f = f
@@ -85,7 +85,10 @@ class Interruption:
         return self._f.op(f"load atomic i64, ptr {self._record.name} monotonic, align 8", INT)
 
     def has_come(self) -> Value:
-        """Return whether a signal has come; called once for each step."""
+        """Return whether a signal has come since the start of the run.
+
+        The code runs once for each step, counts steps, and installs the handler again after `ARMED` steps.
+        """
         f, steps = self._f, self._steps.value + 1
         self._steps.value = steps
         with f.if_(steps.is_(ARMED)):

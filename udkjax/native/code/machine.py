@@ -32,20 +32,20 @@ STACK_PROBE = "__chkstk"  # its name on Windows; a C compiler would link it
 
 
 def _target_machine(level: int) -> Any:
-    """Return a compiler for the processor that `processor.target` names."""
+    """Return a compiler with a level of code generation for the processor that `processor.target` names."""
     cpu, features = target()
     machine = llvm().Target.from_default_triple()
     return machine.create_target_machine(cpu=cpu, features=features, opt=level, reloc="pic", codemodel="small", jit=True)
 
 
 def digest(text: str, level: int = LEVEL) -> str:
-    """Return the key of a program for this processor and compiler."""
+    """Return the name under which the code of a text is stored, for this processor and compiler and a level of optimization."""
     return hashlib.sha256("\0".join((text, _compiler(), str(level), *PASSES)).encode()).hexdigest()[:32]
 
 
 @cache
 def _compiler() -> str:
-    """Return a description of the processor and the compiler."""
+    """Return a text that changes with the processor and the version of the compiler, for digests."""
     import llvmlite
 
     return "\0".join((*target(), llvm().get_default_triple(), llvmlite.__version__))
@@ -59,7 +59,7 @@ def _linker() -> Any:
 
 
 def _address_of_stack_probe() -> int:
-    """Return the address of the function that Windows has functions call whose frame is longer than a page."""
+    """Return the address of the function that each function with a stack frame longer than a page must call on Windows."""
     probe = getattr(ctypes.WinDLL("ntdll"), STACK_PROBE)  # pyright: ignore[reportAttributeAccessIssue]
     address = ctypes.cast(probe, ctypes.c_void_p).value
     assert address is not None
@@ -67,7 +67,15 @@ def _address_of_stack_probe() -> int:
 
 
 class Library:
-    """The machine code of one module, loaded while this object exists; indexing by name returns a function's address."""
+    """The machine code of one module, loaded while this object exists.
+
+    `library[name]` is the address of a function or of a global variable.
+
+    Args:
+        parts: The object code of the parts of the module.
+        names: The names whose addresses are needed.
+        is_optimized: Whether all parts are compiled with the level `LEVEL`.
+    """
 
     _numbers = itertools.count()
 
@@ -87,14 +95,23 @@ class Library:
 
 
 def library(text: str, names: Sequence[str], level: int = LEVEL) -> Library:
-    """Load a module with the functions `names`, from disk or newly compiled."""
+    """Load the code of a module, which is on disk or compiled here.
+
+    Args:
+        text: LLVM's text of the module.
+        names: The names of the functions and global variables whose addresses are needed.
+        level: The level of code generation. Parts whose code of a higher level is on disk have this code.
+
+    Returns:
+        The loaded code.
+    """
     with ThreadPoolExecutor(thread_count()) as pool:
         codes, levels = zip(*pool.map(lambda part: _stored_code(part, level), split_module(text)), strict=True)
     return Library(codes, names, is_optimized=min(levels) == LEVEL)
 
 
 def _stored_code(text: str, level: int) -> tuple[bytes, int]:
-    """Return the code of a level, or of a higher level if that is on disk, and the level."""
+    """Return the object code of a text, and its level: a higher one than `level` if that code is on disk."""
     for stored_level in range(LEVEL, level - 1, -1):
         code = code_cache.read(digest(text, stored_level))
         if code is not None:
@@ -105,9 +122,9 @@ def _stored_code(text: str, level: int) -> tuple[bytes, int]:
 
 
 def split_module(text: str) -> list[str]:
-    """Split a module into modules for parallel compilation, the largest first, each with its declarations.
+    """Return the texts of modules into which a module is split for parallel compilation, the largest first.
 
-    Functions that the module names as apart from others are in groups of their own: another module may have the others.
+    Functions that the module names by `text.apart` share no part with others, which another module may have as well.
     """
     text = f"\n{text}"  # searching for newlines is several times as fast as multiline anchors
     definitions = (text[match.end() : text.index("\n}\n", match.end()) + 3] for match in re.finditer(r"\n(?=define )", text))
@@ -135,7 +152,7 @@ def split_module(text: str) -> list[str]:
 
 
 def compile_module(text: str, level: int = LEVEL) -> bytes:
-    """Compile a module to object code for this processor."""
+    """Return the object code of a module for this processor, compiled at a level of code generation."""
     return object_code(text, _target_machine(level), llvm().get_default_triple(), () if level == QUICK else PASSES)
 
 
@@ -149,14 +166,21 @@ def llvm_for_all_targets() -> Any:
 
 
 def object_code(text: str, machine: Any, triple: str, optimizations: Sequence[str] = PASSES) -> bytes:
-    """Compile a module to object code in a separate context, so that threads can compile in parallel."""
+    """Return the object code of a module for any target, compiled in a separate context, so that threads can work in parallel.
+
+    Args:
+        text: LLVM's text of the module.
+        machine: llvmlite's target machine.
+        triple: LLVM's name of the target.
+        optimizations: The names of the passes before code generation.
+    """
     with optimized(text, machine, triple, optimizations) as module:
         return _emit(machine, module)
 
 
 @contextmanager
 def optimized(text: str, machine: Any, triple: str, optimizations: Sequence[str]) -> Iterator[Any]:
-    """Parse a module for a target, and run passes of optimization on it."""
+    """Yield llvmlite's module of a text for a target, after passes of optimization; it exists within the `with` block only."""
     binding = llvm()
     with binding.create_context() as context, binding.parse_assembly(text, context) as module:
         module.triple = triple
@@ -169,7 +193,7 @@ def optimized(text: str, machine: Any, triple: str, optimizations: Sequence[str]
 
 
 def _emit(machine: Any, module: Any) -> bytes:
-    """Emit object code without the lock that llvmlite holds during each call: LLVM's contexts share nothing."""
+    """Return a module's object code, without the lock that llvmlite holds during each call: LLVM's contexts share nothing."""
     from llvmlite.binding import ffi
 
     with ffi.OutputString() as error:
@@ -193,5 +217,8 @@ def _emission() -> Callable:
 
 
 def function(address: int, *arguments: Any) -> Any:
-    """Return a function at an address, called without Python's global interpreter lock."""
+    """Return the function at an address as a ctypes function without a result, which runs without the global interpreter lock.
+
+    `arguments` are the ctypes types of its arguments.
+    """
     return ctypes.CFUNCTYPE(None, *arguments)(address)

@@ -18,7 +18,7 @@ ARM_BASE = "generic"  # two lanes and fused multiply-add
 
 @dataclass(frozen=True)
 class Level:
-    """A set of instructions by LLVM's name, with a description, and the features by which a processor is known to have it."""
+    """A level of instructions: LLVM's name of it, a description for messages, and the features that a processor must have."""
 
     cpu: str
     words: str
@@ -33,7 +33,7 @@ LEVELS = {1: SSE, 2: SSE, 4: AVX2, 8: AVX512}  # by the number of lanes
 
 @cache
 def llvm() -> Any:
-    """Return LLVM with the compiler for this machine."""
+    """Return llvmlite's module `binding`, with the compiler for this machine initialized."""
     import llvmlite.binding as llvm
 
     llvm.initialize_native_target()
@@ -65,7 +65,10 @@ def lanes() -> int:
 
 @cache
 def target() -> tuple[str, str]:
-    """Return the names of the processor and of the features that code is compiled for: with `UDKJAX_LANES`, those of a level."""
+    """Return LLVM's names of the processor and of its features for which code is compiled.
+
+    These are this processor and all its features or, if `UDKJAX_LANES` is set, a level and "".
+    """
     if not _setting():
         return llvm().get_host_cpu_name(), llvm().get_host_cpu_features().flatten()
     level = LEVELS[lanes()]
@@ -77,7 +80,7 @@ def _setting() -> str:
 
 
 def _suits(count: int) -> bool:
-    """Return whether this processor can run code of a number of lanes."""
+    """Return whether this processor can run the code for a number of lanes, with the instructions of its level."""
     return _has(llvm().get_host_cpu_features(), LEVELS[count].features) if _is_x86() else count <= 2
 
 

@@ -1,16 +1,15 @@
 """Derivatives of a trajectory in reverse mode, by backpropagation through the recorded steps (record.py).
 
 A point is an accepted state (q, v, a) at its time; each step leads from one point to the next. Cotangents of the points are
-accumulated from the last point to the first. Those of an output are pulled back through its projection and interpolation to the
-four points of its polynomial. Those of a point are pulled back through its accelerations and its projection to the end of the
-step before it, and through the sums
+accumulated from the last point to the first. Cotangents of an output are pulled back through its projection and interpolation to
+the four points of its polynomial. Cotangents of a point are pulled back through its accelerations and its projection to the end
+of the step before it, and through the sums
 
     q_i = q + h c_i v + h^2 sum_j (A A)_ij a_j,        v_i = v + h sum_j A_ij a_j
 
 of the stages of this step, the last first, to the previous point. The stages are evaluated again with the intermediate results
-that derivatives need; the transposed programs are those of expressions/algebra/differential.py. Those of
-an implicit method are solved again (stage_equations.py), and cotangents of their accelerations are those of their equations by
-the transpose of D.
+that derivatives need; the transposed programs are those of expressions/algebra/differential.py. The stages of an implicit method
+are solved again (stage_equations.py); D^(-T) turns the cotangents of their accelerations into those of their equations.
 
 Members in lanes are backpropagated together; the next ones are loaded when all are complete.
 """
@@ -31,7 +30,7 @@ from udkjax.native.run.runge_kutta import stage_state
 
 
 class Reverse(Recorded):
-    """A trajectory with backpropagation from cotangents of its outputs and its end; without cotangents it only integrates."""
+    """A module that integrates and returns a record or, in a call with cotangents, backpropagates along records."""
 
     inputs = ("given steps", "given record", "given qs", "given vs", "ysbar", "endbar")
     outputs = ("numbersbar", "qbar", "vbar", "record")
@@ -79,7 +78,7 @@ class Reverse(Recorded):
             self.put_entry(f, "total bar constants", i, f.select(mask, total + change, total))
 
     def _pull_projection(self, f: Function, mask: Value):
-        """Pull `bar result` back through the projection that led to the state, after its evaluation, to `bar state`."""
+        """Pull `bar result` back through the projection of the state, which has been evaluated before, to `bar state`."""
         if self.of_projection:
             f.call("reverse_projection", f.given["work"], self.address(f, "projection linearization"), f.given["work"])
             self._accumulate_constants(f, mask)
@@ -89,12 +88,18 @@ class Reverse(Recorded):
                     self.put(f, f"bar state {x}", r, self.vector(f, f"bar result {x}", r))
 
     def _pull_accelerations(self, f: Function, stored: str, bar: str, mask: Value):
-        """Pull cotangents of accelerations back through the equations at the state, to `bar state`."""
+        """Pull the cotangents of accelerations in the array `bar` back through the equations at the state, to `bar state`.
+
+        `stored`: the array of the intermediate results of their evaluation.
+        """
         f.call("reverse", f.given["work"], self.address(f, stored), self.address(f, bar))
         self._accumulate_constants(f, mask)
 
     def _write_step_back(self):
-        """Write `step_back`: from the cotangents of point 3 to those of point 2, in lanes after their first point (`at`)."""
+        """Write `step_back(work)`: pull the cotangents of point 3 back through the step from point 2, to those of point 2.
+
+        Lanes that have reached their first point (`at` is zero) stay as they are.
+        """
         f, s = self.function("step_back")
         active, implicit = s.at > 0.5, self.stiffness.method
         step = f.select((s.begin > 0.5) | ~active, 0.0, s.point3_t - s.point2_t)
@@ -142,7 +147,7 @@ class Reverse(Recorded):
             self.put(f, "bar point2 a", r, f.select(active, old + self.vector(f, "bar stage0 a", r), old))
 
     def _pull_solved_stages(self, f: Function, s: Lane, h: Value, method: Method, solved: Value, step: Value):
-        """Pull cotangents of the stages of an implicit step back to the point before."""
+        """Pull the cotangents of the stages of an implicit step back to point 2, in the lanes of `solved`."""
         last = method.stages
         with f.each(self.rowcount) as r:
             old, bar = (self.vector(f, name, r) for name in (f"bar stage{last - 1} a", "bar point3 a"))
@@ -157,7 +162,17 @@ class Reverse(Recorded):
     def _accumulate_stage(
         self, f: Function, h: Value, method: Method, i: int, stages: Sequence[int], active: Value, first: bool = False
     ):
-        """Add `bar state` of stage i of a method to the cotangents of the point before and of the earlier stages."""
+        """Pull `bar state`, the cotangents of the state of stage i, back to point 2 and to the accelerations of other stages.
+
+        Args:
+            f: The function to which the code is added.
+            h: The length of the step.
+            method: The method of the step.
+            i: The index of the stage; the number of stages means the end of the step.
+            stages: The indices of the stages on which the state of stage i depends.
+            active: The lanes that change.
+            first: True to set the cotangents of these accelerations, instead of adding to them.
+        """
         zero = f.const(0.0, DOUBLE, self.plan.vector)
         with f.each(self.rowcount) as r:
             of_q, of_v = (self.vector(f, f"bar state {x}", r) for x in "qv")
@@ -181,9 +196,10 @@ class Reverse(Recorded):
         f.call("end_walk", *arguments)
 
     def _write_walk(self):
-        """Write the backpropagation of members that are `ready`: its beginning, its steps while there are points, and its end.
+        """Write `begin_walk`, `walk` and `end_walk`, functions of (work, call): backpropagation of members that are `ready`.
 
-        The last cotangent is that of the given initial state, which is also the first output.
+        `walk` goes one step back. At the end, the cotangents of the first output, which is the given initial state, are added to
+        those of this state.
         """
         f, s = self.function("begin_walk", ARGUMENTS[:2])
         self._begin_backpropagation(f, s)
@@ -255,7 +271,7 @@ class Reverse(Recorded):
     def _pull_output(self, f: Function, s: Lane):
         """Pull the cotangents of the outputs that are `due` back through projection and interpolation, to `bar difference`.
 
-        q = sum_k N_k pi_k and v = sum_k N_k pi_k', with the differences N_k and the products pi_k of differences of times.
+        q = sum_k N_k pi_k and v = sum_k N_k pi_k', with divided differences N_k and products pi_k of differences of times.
         """
         n, mask = self.n, s.due > 0.5
         with f.each(n) as i:
@@ -343,5 +359,5 @@ class Reverse(Recorded):
             self.put_lane_entry(f, "total bar constants", k, 0.0, i)
 
     def _result(self, f: Function, name: str, k: Value, length: Operand) -> Value:
-        """Return the address of an output of the member in lane k, of `length` numbers for each member."""
+        """Return the address of the output `name` of the member in lane k; the output has `length` numbers for each member."""
         return self.result_address(f, name, self.to_int(f, self.lane_entry(f, "member", k)), length)

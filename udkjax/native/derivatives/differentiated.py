@@ -10,7 +10,8 @@ from udkjax.native.run.trajectory import Trajectory
 class Differentiated(Trajectory):
     """Base of forward and reverse mode: programs of derivatives, and memory for their intermediate results.
 
-    `active` marks the numbers of the scene that have derivatives; positions and velocities always have them.
+    `active` marks the numbers of the scene with respect to which derivatives are needed; those with respect to positions and
+    velocities always are.
     """
 
     def __init__(self, plan: Plan, active: tuple[bool, ...]):
@@ -32,7 +33,10 @@ class Differentiated(Trajectory):
         self.accelerations.accelerate_exactly(f, f"stage{i} a")  # derivatives are the same for all methods
 
     def evaluate_settled(self, f: Function, out: str, stored: str):
-        """Compute accelerations at `state`, with settled friction, and the intermediate results of their derivatives."""
+        """Compute accelerations at `state`, with settled friction, and the intermediate results that their derivatives need.
+
+        They are stored in the arrays `out` and `stored`.
+        """
 
         def settle():
             self.friction.settle(f, out)
@@ -44,12 +48,12 @@ class Differentiated(Trajectory):
         self.fallback.evaluate_settled(f, Lane(f, self.places), settle, evaluate)
 
     def _evaluate_solved(self, f: Function, i: int):
-        """Evaluate what derivatives need at the state of a solved stage of an implicit method, and factorize its matrix there."""
+        """Compute the intermediate results for derivatives at the state of solved stage i, and factorize its matrix D there."""
         self.evaluate_settled(f, "residual a", f"stage{i} linearization")
         f.call("factor_exact", f.given["work"])
 
     def _solve_transposed(self, f: Function, name: str):
-        """Replace cotangents w of the accelerations of a solved stage by D^(-T) w."""
+        """Replace w, the cotangents of the accelerations of a solved stage in the array `name`, by D^(-T) w."""
         d = self.stiffness.exact(f)
         with f.each(self.rowcount) as r:
             d.row("x")[r] = self.vector(f, name, r)
@@ -69,16 +73,19 @@ class Differentiated(Trajectory):
 
     @property
     def _linearizations(self) -> list[ProgramDerivative]:
-        """The differentiable programs of the module."""
+        """The derivatives of the module's programs: of the accelerations and, if states are projected, of the projection."""
         return [x for x in (self.of_accelerations, self.of_projection) if x]
 
     @property
     def _shares_factors(self) -> bool:
-        """True if the programs of the end of a step share a factorization: friction may leave out more rows than a projection."""
+        """True if one program evaluates accelerations and projection at the end of a step, with a common factorization.
+
+        With friction that depends on loads, the accelerations may leave out more rows than the projection.
+        """
         return bool(self.unrolled and self.of_projection) and not self.friction.settles
 
     def _evaluate_end(self, f: Function):
-        """Evaluate accelerations and a projection at the end of a step for their derivatives."""
+        """Compute the intermediate results for derivatives of accelerations and projection at the end of a step."""
         stored = f"stage{self.last} linearization"
         if self._shares_factors:
             f.call("evaluation_end", f.given["work"], self.address(f, stored), self.address(f, "projection linearization"))
@@ -87,6 +94,6 @@ class Differentiated(Trajectory):
             self._evaluate_projection(f)
 
     def _evaluate_projection(self, f: Function):
-        """Evaluate the projection at the state, which lies on the manifold, for its derivatives."""
+        """Compute the intermediate results for derivatives of the projection at the state, which lies on the manifold."""
         if self.of_projection:
             f.call("evaluation_projection", f.given["work"], f.given["work"], self.address(f, "projection linearization"))

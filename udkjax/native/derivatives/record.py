@@ -33,7 +33,7 @@ def record_length(n: int, points: int) -> int:
 
 
 def row_length(n: int) -> int:
-    """Return the length of a point with n coordinates."""
+    """Return the length of one point of a record, with n coordinates."""
     return HEAD + 3 * n
 
 
@@ -55,7 +55,7 @@ class Recorded(Differentiated):
         return (*fields, *(BUFFER if self.has_buffer else ()), following)
 
     def backpropagates(self, f: Function) -> Value:
-        """Return whether there are cotangents."""
+        """Return true if this is the second call, which has cotangents and backpropagates."""
         return self.field(f, "directions") > 0
 
     def _returns_record(self, f: Function) -> Value:
@@ -113,9 +113,10 @@ class Recorded(Differentiated):
         self.put_lane_entry(f, "capacity", k, f.like(f.arithmetic("div", length - len(TITLE), self.row), DOUBLE, 1))
 
     def write_end_record(self):
-        """Write `end_record(work, call, lane)`: the title of a record in the output, without points if they did not fit.
+        """Write `end_record(work, call, lane)`: write the title of a lane's record to the output, and zeros after its points.
 
-        Zeros follow its points. `finish_members` would write them slowly, since it is not optimized.
+        If the points did not fit, the record is written without points. `finish_members` would write the zeros slowly, since it
+        is not optimized.
         """
         f, _ = self.function("end_record", ARGUMENTS)
         k = f.given["lane"]
@@ -134,7 +135,7 @@ class Recorded(Differentiated):
             f.store(0.0, to, i)
 
     def _allocate_record(self, f: Function, k: Value, member: Value):
-        """Allocate the record of lane k, for the steps of the first call; without memory the lane stays empty."""
+        """Allocate the record of lane k, with room for the steps of the first call; without memory the lane stays empty."""
         if self.has_buffer:
             capacity = self.field(f, "capacity")
             number = (member - self.field(f, "first")) * (capacity * self.row)
@@ -150,9 +151,9 @@ class Recorded(Differentiated):
             self.put_lane_entry(f, "active", k, 0.0)
 
     def _extend_record(self, f: Function, k: Value):
-        """Make room for more points of lane k than the first call had, which may have rounded otherwise.
+        """Double the room for points of lane k: there are more than in the first call, which may have rounded differently.
 
-        Without memory the run ends at its next step.
+        If memory is refused, the run ends at its next step.
         """
         capacity = self.lane_entry(f, "capacity", k)
         if self.has_buffer:
@@ -209,7 +210,7 @@ class Recorded(Differentiated):
 
     @abstractmethod
     def walk(self, f: Function, s: Lane, repeat: Repeat):
-        """Backpropagate the members of lanes that are `ready`, by repeated steps back."""
+        """Backpropagate the members of lanes that are `ready`; `repeat(goes_on, step)` repeats the step back."""
 
     # --- points
 
@@ -235,7 +236,7 @@ class Recorded(Differentiated):
             self.put_lane_entry(f, "points", k, points + 1.0)
 
     def _load_point(self, f: Function, k: Value, number: Value, point: str):
-        """Load a point of lane k from its record; negative indices mean the first point."""
+        """Load point `number` of the record of lane k into the arrays of `point`; negative numbers mean the first point."""
         row = f.at(self._record(f, k), self.to_int(f, f.max(number, 0.0)) * self.row)
         self.put_lane_entry(f, f"{point}_t", k, f.load(row, 0))
         self.put_lane_entry(f, f"{point}_solved", k, f.max(-f.load(row, 2), 0.0))

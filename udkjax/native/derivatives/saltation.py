@@ -20,19 +20,21 @@ NO_JUMP = 100 * EDGE  # a smaller relative difference is no jump: a step across 
 
 
 def add_memory(module: Differentiated):
-    """Reserve memory for the derivatives before a step across, and for three tangents, of which only the first changes."""
+    """Reserve memory for the linearization before a step across, and for three tangents, the first of which is the motion."""
     module.places.add(BEFORE, module.of_accelerations.stored)
     module.places.add(MOTION, len(module.ways) * module.tangents.size * (module.tangents.width // module.plan.width))
 
 
 def write_saltation(module: Differentiated):
-    """Write `along_motion` and `jump`, which change the tangents at the end of a step across."""
+    """Write `along_motion` and `jump`, which together add the jump to the second derivatives at the end of a step across."""
     _write_along_motion(module)
     _write_jump(module)
 
 
 def _write_along_motion(module: Differentiated):
-    """Write `along_motion`: differentiate the accelerations along the motion, at both ends of a step from point 2 to point 3.
+    """Write `along_motion(work)`: differentiate the accelerations along the motion, at both ends of the step across.
+
+    The step leads from point 2 to point 3.
 
     The state is point 3, where the accelerations have been evaluated, and is so again afterwards.
     """

@@ -15,11 +15,11 @@ class ForwardTwice(Forward):
     Second derivatives are the same sums over stages, ends of steps and outputs; the programs of accelerations and projections
     compute them together with the tangents along either direction.
 
-    They are lost, NaN, where a step by the fallback leaves unbounded loads of joints out of their friction. Near the singular
-    configuration such a load is c / d, with the distance d. The steps of a run keep the range without it at the same distances,
-    but steps are not differentiated: along a change that moves the configuration by x there, the range stays behind, and the
-    second derivatives of log d at its two ends, -(x / d)^2, are missing. This error does not decrease with the steps. They are
-    lost, too, where a load that depends on time changes its sign: the jump (saltation.py) is that of a surface at rest.
+    They become NaN where a step by the fallback leaves unbounded loads of joints out of their friction. Near the singular
+    configuration such a load is c / d, with the distance d, and a run omits it within a range of distances. But steps are not
+    differentiated: if a change of the run moves the configuration by x, the ends of the range do not move with it, and the second
+    derivatives of log d at the two ends, -(x / d)^2, are missing. This error does not decrease with the steps. They also become
+    NaN where a load that depends on time changes its sign: the jump (saltation.py) is that of a surface at rest.
     """
 
     mode = TWICE
@@ -50,7 +50,7 @@ class ForwardTwice(Forward):
                     f.call("jump", f.given["work"], f.given["tangent"])
 
     def _lose(self, f: Function, lanes: Value):
-        """Set the second derivatives of the end of a step to NaN in some lanes."""
+        """Set the second derivatives of the state at the end of a step to NaN in some lanes."""
         for name in ("result q", "result v"):
             with self._each_group(f), self._in_way(f, self.ways[-1]), f.each(self.registers("tangent")) as r:
                 self.put(f, name, r, f.select(lanes, float("nan"), self.vector(f, name, r, "tangent")), "tangent")

@@ -71,7 +71,7 @@ class Forward(Differentiated):
         write_between(self, "tangent_between", ("tangent", w))
 
     def write_prologue_derivative(self):
-        """Write the tangents of the constants, if numbers have any."""
+        """Write the function that computes the tangents of the constants from those of the numbers, if any constant moves."""
         if self.count:
             write_prologue_derivative(self, self.active, self.mode)
 
@@ -83,7 +83,7 @@ class Forward(Differentiated):
 
     @contextmanager
     def _each_tangent(self, f: Function, step: int = 1) -> Iterator[Value]:
-        """Run the block for every `step`-th tangent of all groups."""
+        """Run the block for every `step`-th tangent of all groups, with `tangent` set to its memory."""
         first = self.first_tangent(f)
         with f.each(self.groups(f) * (len(self.ways) // step)) as p:
             f.given["tangent"] = f.at(first, p * (step * self.tangents.size * self.tangents.width))
@@ -91,14 +91,18 @@ class Forward(Differentiated):
 
     @contextmanager
     def _each_direction(self, f: Function, p: Value, lane: Value) -> Iterator[tuple[Value, Value]]:
-        """Run the block for every direction of group p for the member in a lane: its index, and its lane in the tangent."""
+        """Run the block for every direction of group p, for the member in a lane.
+
+        Yields:
+            The index of the direction, and its lane in the tangent.
+        """
         with f.each(self.group) as j:
             direction = p * self.group + j
             with f.if_(direction < self.field(f, "directions")):
                 yield direction, lane if self.group == 1 else j
 
     def _way(self, f: Function, way: str) -> Value:
-        """Return the address of one of the tangents of a group."""
+        """Return the address of the tangent `way`, one of `ways`, in the current group."""
         return f.at(f.given["tangent"], self.ways.index(way) * self.tangents.size * self.tangents.width)
 
     def _call_derivative(self, f: Function, name: str, stored: str, out: Value | None = None):
@@ -106,7 +110,7 @@ class Forward(Differentiated):
         f.call(name, f.given["work"], self.address(f, stored), tangent, out or tangent)
 
     def _project_tangent(self, f: Function):
-        """Compute `result` of a tangent, the projection of its `state`, at a state on the manifold."""
+        """Project the tangents `state q` and `state v` of the current group to `result q` and `result v`, on the manifold."""
         if self.of_projection:
             self._call_derivative(f, f"{self.mode}_projection", "projection linearization")
         else:
@@ -119,7 +123,7 @@ class Forward(Differentiated):
             f.given["tangent"] = group
 
     def record_stage(self, f: Function, s: Lane, i: int):
-        """Compute the tangents of the stage's accelerations."""
+        """Compute the tangents of the accelerations of stage i."""
         h = self.broadcast(f, s.step)
         with self._each_tangent(f):
             self._change_stage(f, i, h, "point3")
@@ -127,7 +131,10 @@ class Forward(Differentiated):
             self._call_derivative(f, self.mode, f"stage{i} linearization", self._tangent_address(f, f"stage{i} a"))
 
     def record_solved_stage(self, f: Function, s: Lane, i: int):
-        """Compute the tangents of the accelerations of a solved stage; second derivatives from those along each direction."""
+        """Compute the tangents of the accelerations of solved stage i of an implicit step.
+
+        Second derivatives come last, as they depend on the tangents along either direction.
+        """
         name, method, h, mask = f"stage{i} a", self.stiffness.method, self.broadcast(f, s.step), s.stepping > 0.5
         self._evaluate_solved(f, i)
         for ways in ([way for way in self.ways if way in GIVEN], self.ways[-1:]):
@@ -150,14 +157,14 @@ class Forward(Differentiated):
 
     @contextmanager
     def _in_way(self, f: Function, way: str) -> Iterator[None]:
-        """Run the block with one of the tangents of a group."""
+        """Run the block with `tangent` set to the memory of the tangent `way` of the current group."""
         group = f.given["tangent"]
         f.given["tangent"] = self._way(f, way)
         yield
         f.given["tangent"] = group
 
     def _solve(self, f: Function, p: Value, name: str, ways: Sequence[str]):
-        """Solve D x = b in some tangents of group p, in place of the array b."""
+        """Replace b, the array `name`, by the solution x of D x = b, in the tangents `ways` of group p."""
         d = self.stiffness.exact(f)
         b, x = d.row("b"), d.row("x")
         for way in ways:
@@ -216,7 +223,7 @@ class Forward(Differentiated):
                 self.put(f, f"point3 {x}", r, f.select(accept, new, old), "tangent")
 
     def _project_end(self, f: Function, begin: Value):
-        """Project the tangents of the state at the end of a step."""
+        """Project the tangents of the state at the end of a step; `begin`: the lanes whose step is the beginning of a run."""
         del begin  # only second derivatives, which project the initial state twice, need it
         with self._each_group(f):
             self._project_tangent(f)
@@ -225,10 +232,22 @@ class Forward(Differentiated):
                 self.put(f, f"state {x}", r, self.vector(f, f"result {x}", r, "tangent"), "tangent")
 
     def _finish_change(self, f: Function, s: Lane, accept: Value):
-        """Hook: change the tangents of the end of a step, `result q` and `result v`."""
+        """Hook: change `result q` and `result v`, the tangents of the state at the end of a step. Does nothing by default.
+
+        Called for accepted steps, in lanes that `accept`, before these tangents are stored as those of point 3.
+        """
 
     def _change_stage(self, f: Function, i: int, h: Value, start: str, method: Method | None = None, mask: Value | None = None):
-        """Compute the state of stage i in a tangent, for the step from a point by a method, in all or some lanes."""
+        """Compute the tangents of the state of stage i, as `state q` and `state v` of the current tangent.
+
+        Args:
+            f: The function to which the code is added.
+            i: The index of the stage; the number of stages means the end of the step.
+            h: The length of the step.
+            start: The point from which the step starts.
+            method: The method of the step; None: the method of the module.
+            mask: The lanes that change; None: all lanes.
+        """
         method = method or self.method
         node, names = float(method.nodes[i]), [f"{start} a", *self.stage_accelerations[1:]]
         with f.each(self.registers("tangent")) as r:
@@ -256,7 +275,10 @@ class Forward(Differentiated):
                 self._write_change(f, s, k, p, self.to_int(f, f.lane(s.written, k)) + 1, "result q", "result v")
 
     def _write_change(self, f: Function, s: Lane, k: Value, p: Value, number: Value, q: str, v: str):
-        """Write the derivatives of a state of the member in lane k along the directions of group p, from its last tangent."""
+        """Write the derivatives of output state `number` of the member in lane k, along the directions of group p.
+
+        They are the arrays `q` and `v` of the current tangent.
+        """
         member, times = self.to_int(f, f.lane(s.member, k)), self.field(f, "times")
         with self._each_direction(f, p, k) as (direction, lane):
             row = (member * self.field(f, "directions") + direction) * times + number
@@ -281,7 +303,10 @@ class Forward(Differentiated):
                     f.store(f.load(changes, i), self._way(f, way), tangent_lane + self.place("constants", i, "tangent"))
 
     def _changes_of_numbers(self, f: Function, way: str, member: Value, direction: Value) -> Value:
-        """Return the address of a member's tangents along a direction; those of sampled numbers are of the current row."""
+        """Return the address of the tangents of a member's numbers along a direction.
+
+        The tangents of sampled numbers are those of the lane's current row of samples.
+        """
         count = self.code.number_count
         numbers = f.at(self.member_address(f, f"{way}numbers", member), direction * count)
         places = self.active_samples
@@ -308,7 +333,10 @@ class Forward(Differentiated):
     def _read_state(
         self, f: Function, way: str, member: Value, direction: Value, tangent: Value, place: Value, to: Sequence[str]
     ):
-        """Read the tangent of the initial state of a member along a direction into a lane of arrays of a tangent."""
+        """Read the tangent of the initial state of a member along a direction into the arrays `to` of a tangent.
+
+        `place` is the lane of the direction in the tangent. Tangents along both of a pair of directions are zero.
+        """
         for x in "qv":
             start = self.member_address(f, f"{way}{x}", member) if way in GIVEN else None
             with f.each(self.n) as i:
@@ -317,7 +345,7 @@ class Forward(Differentiated):
                     f.store(change, tangent, place + self.place(f"{array} {x}", i, "tangent"))
 
     def end_members(self, f: Function, s: Lane):
-        """Write the tangents of the initial state, as given, and of the last state; outputs that are not kept have none."""
+        """Write the tangents of the initial state, as given, and of the last state; outputs that are not kept get zeros."""
         way, times = self.ways[-1], self.field(f, "times")
         with self._each_group(f) as p, self.each_lane(f, s.due) as k:
             f.given["tangent"], member = self._way(f, way), self.to_int(f, f.lane(s.member, k))

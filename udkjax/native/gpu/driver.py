@@ -15,7 +15,7 @@ LIBRARY = "nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1"
 
 
 class CudaError(RuntimeError):
-    """An error of the CUDA driver, in its own words."""
+    """An error of the CUDA driver, in the driver's words."""
 
 
 class CudaDriver:
@@ -25,7 +25,7 @@ class CudaDriver:
         library: libcuda, or an object with functions of the same names.
 
     Raises:
-        CudaError: the driver finds no device, or does not fit it.
+        CudaError: the driver cannot be initialized, for example because it finds no device.
     """
 
     def __init__(self, library: Any):
@@ -66,11 +66,11 @@ class CudaDriver:
         return self._answer("cuDeviceGetCount", ctypes.c_int)
 
     def attribute(self, which: int, ordinal: int) -> int:
-        """Return an attribute of a device (CUdevice_attribute), for example 75 and 76 for its compute capability."""
+        """Return the attribute `which` (CUdevice_attribute) of a device, for example 75 and 76 for its compute capability."""
         return self._answer("cuDeviceGetAttribute", ctypes.c_int, which, self._device(ordinal))
 
     def primary_context(self, ordinal: int) -> int:
-        """Return the context of a device that JAX uses as well; it is retained for as long as the process runs."""
+        """Return the handle of the context of a device that JAX uses as well; the context is retained until the process ends."""
         with self._retaining:
             if ordinal not in self._contexts:
                 self._contexts[ordinal] = self._answer("cuDevicePrimaryCtxRetain", ctypes.c_void_p, self._device(ordinal))
@@ -89,7 +89,7 @@ class CudaDriver:
         return self._answer("cuDeviceGet", ctypes.c_int, ordinal)
 
     def _answer(self, name: str, kind: Any, *arguments: int) -> Any:
-        """Return the number that a function writes to the address in its first argument."""
+        """Return the number that a function of the driver writes to the address which is its first argument."""
         found = kind()
         self(name, ctypes.addressof(found), *arguments)
         return found.value
@@ -97,7 +97,7 @@ class CudaDriver:
 
 @cache
 def driver() -> CudaDriver | None:
-    """Return the driver of this machine; None without a driver or without a device."""
+    """Return the driver of this machine; None if there is no driver or no device."""
     try:
         return CudaDriver(ctypes.CDLL(LIBRARY))
     except (OSError, CudaError):

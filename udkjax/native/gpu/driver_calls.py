@@ -1,4 +1,4 @@
-"""Calls of the driver from machine code: handlers have the addresses of its functions in their `words`."""
+"""Calls of the driver from machine code: each handler has a table of words with the addresses of the driver's functions."""
 
 import ctypes
 
@@ -18,7 +18,7 @@ STRNCAT = "declare ptr @strncat(ptr, ptr, i64)"
 
 
 class Words:
-    """Table of 64-bit words that a handler reads: addresses of functions of the CUDA driver, then further numbers.
+    """The table of 64-bit words that a handler reads: addresses of functions of the CUDA driver, then further numbers.
 
     Args:
         functions: the names of functions, in addition to those that every handler needs.
@@ -51,7 +51,10 @@ class Words:
         return f.op(f"zext i32 {answer.name} to i64", INT)
 
     def error(self, f: Function, frame: Value, failed: bytes, answer: Value) -> Value:
-        """Create XLA's error for an error of the driver, in the driver's words after our own."""
+        """Return the address of a new error of XLA for an error of the driver.
+
+        Its message is `failed`, followed by the driver's description of the `answer` of one of its functions.
+        """
         text, place = text_of(f, failed, MOST_WORDS), Value(f, f.reserve(POINTER), POINTER)
         f.store(Value(f, "null", POINTER), place, base=POINTER)
         self.drive(f, DESCRIBE, answer, place)
@@ -63,7 +66,7 @@ class Words:
 
 
 def stream_of(f: Function, frame: Value) -> Value:
-    """Return the stream of a call on a card; the handler returns XLA's error if there is none."""
+    """Return the stream on which XLA calls a handler; without a stream, the handler returns XLA's error."""
     asked = arguments_struct(f, word(f, frame, CONTEXT, POINTER), f.const(0, INT))
     refused = call_with(f, frame, STREAM, asked)
     with f.if_(~f.is_null(refused)):

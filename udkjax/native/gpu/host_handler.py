@@ -63,7 +63,7 @@ LIBC = (*ALLOCATION, "declare i32 @pthread_create(ptr, ptr, ptr, ptr)", "declare
 def register(name: str, handler: int) -> str:
     """Make an operation of the CPU callable from programs of graphics cards; return the name of its FFI target there.
 
-    Without a graphics card nothing is registered: the program is only written here.
+    Without a graphics card nothing is registered: programs are then only written here, to run elsewhere.
 
     Args:
         name: the name of the target on the CPU.
@@ -83,7 +83,7 @@ _REGISTERING = Lock()
 
 
 def load(of: CudaDriver, handler: int, threads: int | None = None) -> machine.Library:
-    """Load the handler `copy_and_call(frame)` of one operation.
+    """Return the loaded code of the handler `copy_and_call(frame)` for one operation.
 
     Args:
         of: the driver.
@@ -98,7 +98,7 @@ def load(of: CudaDriver, handler: int, threads: int | None = None) -> machine.Li
 
 @cache
 def _pinned(of: CudaDriver) -> int:
-    """Return the address of new page-locked memory of the host; 0 if the driver has none."""
+    """Return the address of the page-locked memory of the host that all operations share; 0 if the driver cannot allocate it."""
     place = ctypes.c_int64()
     try:
         with of.current(_device()):
@@ -110,19 +110,19 @@ def _pinned(of: CudaDriver) -> int:
 
 
 def _device() -> int:
-    """Return the number of a device on which JAX computes already: a context on another would take its memory."""
+    """Return the number of a card on which JAX computes already: a new context on another card would take memory there."""
     return jax.local_devices(backend="cuda")[0].local_hardware_id
 
 
 @cache
 def module_text() -> str:
-    """Return the text of the module."""
+    """Return LLVM's text of the module with the handler, the same for all operations."""
     functions = [_thread_count(), _schedule(), _copy_and_call()]
     return text_of_module(functions, [WORDS.text], LIBC)
 
 
 def _copy_and_call() -> Function:
-    """Write the handler that copies inputs to the host, runs the operation there, and copies outputs back."""
+    """Return the handler: it copies inputs to the host, runs the operation there, and copies outputs back."""
     f = Function("copy_and_call", [(POINTER, "frame")], returns="ptr", cold=True)
     frame = f.given["frame"]
     answer_metadata(f, frame)
@@ -144,7 +144,7 @@ def _copy_and_call() -> Function:
 
 
 def _block(f: Function, size: Value) -> tuple[Value, Value]:
-    """Return memory of `size` bytes, or null, and whether it is the pinned memory, which is then marked as in use."""
+    """Return the address of `size` bytes, or null; and whether they are in the pinned memory, which is then marked as in use."""
     block, is_pinned = f.variable(Value(f, "null", POINTER), POINTER, 1), f.variable(False, BOOL, 1)
     pinned = WORDS.load(f, PINNED)
     with f.if_(size <= WORDS.load(f, PINNED_SIZE, INT)):
@@ -179,7 +179,7 @@ def _aligned(f: Function, size: Value) -> Value:
 
 
 def _total_bytes(f: Function, frame: Value) -> Value:
-    """Return the number of bytes that `_frame_on_host` takes."""
+    """Return the number of bytes that `_frame_on_host` needs for a frame."""
     fixed = (word(f, frame, 0), word(f, word(f, frame, API, POINTER), 0))
     total = f.variable(ALIGNMENT, INT, 1)
     for size in fixed:
@@ -229,7 +229,11 @@ def _frame_on_host(f: Function, frame: Value, block: Value) -> Value:
 
 
 def _run(f: Function, frame: Value, on_host: Value, stream: Value) -> tuple[Variable, Variable]:
-    """Copy, call the operation, and copy back; return the first error of the driver, or 0, and the operation's, or null."""
+    """Copy the arguments to the host, call the operation, and copy the results back.
+
+    Returns:
+        The first error number of the driver, 0 without an error; and the operation's error of XLA, null without an error.
+    """
     place, error = Value(f, f.reserve(POINTER), POINTER), f.variable(Value(f, "null", POINTER), POINTER, 1)
     answer = f.variable(WORDS.drive(f, CONTEXT_OF_STREAM, stream, place), INT, 1)
 
@@ -258,7 +262,7 @@ def _run(f: Function, frame: Value, on_host: Value, stream: Value) -> tuple[Vari
 
 
 def _thread_count() -> Function:
-    """Write XLA_FFI_ThreadPool_NumThreads: return the number of threads that the word `THREADS` holds."""
+    """Return a function in place of XLA_FFI_ThreadPool_NumThreads: it answers the number of threads in the word `THREADS`."""
     f = Function("thread_count", [(POINTER, "given")], returns="ptr", cold=True)
     f.store(WORDS.load(f, THREADS, INT), word(f, f.given["given"], GIVEN, POINTER), base=INT)
     f.line("ret ptr null")
@@ -266,7 +270,10 @@ def _thread_count() -> Function:
 
 
 def _schedule() -> Function:
-    """Write XLA_FFI_ThreadPool_Schedule: start a thread (20 us) for each task; if that fails, the caller runs the task."""
+    """Return a function in place of XLA_FFI_ThreadPool_Schedule: it starts a thread (20 us) for each task.
+
+    If no thread can be started, the caller's thread runs the task.
+    """
     f = Function("schedule", [(POINTER, "given")], returns="ptr", cold=True)
     task, data = (word(f, f.given["given"], offset, POINTER) for offset in (GIVEN, GIVEN + 8))
     thread = Value(f, f.reserve(INT), POINTER)

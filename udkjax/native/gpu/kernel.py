@@ -54,7 +54,7 @@ define ptx_kernel void @{NAME}(ptr byval([FIELDS x i64]) align 8 %call) {{
 
 @dataclass(frozen=True)
 class KernelCode:
-    """The code of a kernel, with the module whose call record it takes."""
+    """The code of a kernel, and the module, which describes the call record that the kernel takes."""
 
     module: Memory
     code: ThreadCode
@@ -74,7 +74,7 @@ class KernelCode:
 
 
 def kernel_code(operation: Operation, directions: int = 0, shares_numbers: bool = False) -> KernelCode:
-    """Write the kernel of an operation; raise `UnsupportedError` if there is none.
+    """Return the code of the kernel of an operation; raise `UnsupportedError` if the operation cannot run as a kernel.
 
     Args:
         operation: The operation.

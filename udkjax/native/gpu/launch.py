@@ -34,7 +34,7 @@ LOCAL_BYTES, MAJOR, MINOR, MULTIPROCESSORS, THREADS_EACH = 3, 75, 76, 16, 39
 
 
 def kernel_members() -> float:
-    """Return the smallest number of members that run as a kernel: `UDKJAX_KERNEL_MEMBERS`, infinite for "never"."""
+    """Return the smallest number of members that run as a kernel: `UDKJAX_KERNEL_MEMBERS` if it is set; infinite for "never"."""
     setting = os.environ.get("UDKJAX_KERNEL_MEMBERS", "").strip()
     if not setting:
         return MEMBERS_OF_CORE * thread_count()
@@ -46,7 +46,7 @@ def kernel_members() -> float:
 
 
 def kernel_target(operation: Operation, inputs: Sequence[Any]) -> str | None:
-    """Return the FFI target that runs a batch as a kernel; None if the host is to run it.
+    """Return the name of the FFI target that runs a batch as a kernel; None if the batch has to run on the host.
 
     Args:
         operation: the operation.
@@ -63,9 +63,10 @@ def kernel_target(operation: Operation, inputs: Sequence[Any]) -> str | None:
 
 @lru_cache(maxsize=256)
 def _load(operation: Operation, directions: int, shares_numbers: bool) -> str | None:
-    """Compile and register the kernel of an operation; return its target, None if its threads take too much memory.
+    """Compile and register the kernel of an operation; return the name of its FFI target.
 
-    Without a graphics card nothing is compiled: the program is only written here.
+    None if its threads take too much memory, or the card or its driver is too old. Without a graphics card nothing is compiled:
+    programs are then only written here, to run elsewhere.
     """
     code, found = kernel_code(operation, directions, shares_numbers), driver()
     if 8 * code.code.size > MOST_MEMORY:
@@ -90,7 +91,7 @@ _reserved: dict[int, int] = {}  # bytes of all threads' memory that the driver h
 
 
 def load_kernel(of: CudaDriver, code: KernelCode) -> int | None:
-    """Return the handle of a kernel for all devices; None if the driver or a device is too old for it."""
+    """Compile and load a kernel; return its handle for all devices. None if the driver or a device is too old for the kernel."""
     kinds = {(of.attribute(MAJOR, k), of.attribute(MINOR, k)) for k in range(of.device_count())}
     if min(kinds) < target.OLDEST:
         return None
@@ -110,7 +111,7 @@ def load_kernel(of: CudaDriver, code: KernelCode) -> int | None:
 
 
 def _has_memory(of: CudaDriver, kernel: int) -> bool:
-    """Return whether each device has the memory that the driver will reserve for the threads of a kernel."""
+    """Return whether each device has the memory that the driver will reserve for the threads of a kernel; note it as reserved."""
     for k in range(of.device_count()):
         with of.current(k):
             size, free, total = ctypes.c_int(), ctypes.c_size_t(), ctypes.c_size_t()
@@ -124,7 +125,7 @@ def _has_memory(of: CudaDriver, kernel: int) -> bool:
 
 
 def load_handler(of: CudaDriver, code: KernelCode, kernel: int) -> machine.Library:
-    """Load the handler `launch(frame)` of a kernel."""
+    """Return the loaded code of the handler `launch(frame)` for a kernel, which is given by its code and its handle."""
     text = text_of_module([launch_handler(code)], [WORDS.text])
     library = machine.library(text, ("launch", "words"))
     WORDS.fill(library, of, kernel)

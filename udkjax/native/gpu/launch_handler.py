@@ -36,7 +36,7 @@ DATA = 40  # offset in bytes of the address in the arguments of XLA's function t
 
 
 def launch_handler(code: KernelCode) -> Function:
-    """Write the handler `launch(frame)`."""
+    """Return the handler `launch(frame)` for a kernel."""
     f = Function("launch", [(POINTER, "frame")], returns="ptr", cold=True)
     answer_metadata(f, f.given["frame"])
     _Launch(f, code).write()
@@ -45,7 +45,7 @@ def launch_handler(code: KernelCode) -> Function:
 
 
 class _Launch:
-    """The text of a handler after its answer to a request of metadata."""
+    """The writer of a handler's code after the answer to a request of metadata."""
 
     def __init__(self, f: Function, code: KernelCode):
         self.f, self.module, self.frame = f, code.module, f.given["frame"]
@@ -84,7 +84,7 @@ class _Launch:
             self.answer.value = WORDS.drive(self.f, name, *arguments)
 
     def _run(self, members: Value):
-        """Launch one thread for each member."""
+        """Launch the kernel, with one thread for each of a number of members."""
         f, parameters = self.f, Value(self.f, self.f.reserve(POINTER), POINTER)
         f.store(self.call, parameters, base=POINTER)
         blocks = f.arithmetic("div", members + (BLOCK - 1), BLOCK)
@@ -105,12 +105,12 @@ class _Launch:
             capacity.value, goes_on.value = capacity.value * 2, is_short
 
     def _copy(self, function: str, to: Value, source: Value, size: int):
-        """Copy between the host and the card, and wait."""
+        """Copy `size` bytes between the host and the card, in the direction of the driver's `function`, and wait."""
         self._drive(function, to, source, f"i64 {size}", self.stream)
         self._drive(WAIT, self.stream)
 
     def _run_with(self, capacity: Value) -> Value:
-        """Run all members with records of a capacity (points); return whether it was too small for one of them."""
+        """Run all members with room for `capacity` points in each record; return whether a record was too short."""
         f, module = self.f, self.module
         assert isinstance(module, Recorded)
         each = capacity * (8 * module.row)

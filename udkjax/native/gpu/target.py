@@ -22,13 +22,13 @@ PASSES = machine.PASSES
 
 
 def compile_kernel(text: str, capability: tuple[int, int], is_assembled: bool = True) -> bytes:
-    """Compile a kernel for a compute capability, from disk or newly compiled.
+    """Return the code of a kernel for a compute capability, from the cache on disk or newly compiled.
 
     Args:
         text: LLVM's text.
         capability: major and minor number.
-        is_assembled: whether to assemble it by `ptxas`, if there is one, to a cubin for this capability only. The result is else
-            PTX for this capability and later ones, which the driver assembles in seconds each time it loads it.
+        is_assembled: whether to assemble the kernel by `ptxas`, if there is one, to a cubin for this capability only. Otherwise
+            the result is PTX for this capability and later ones, which the driver assembles in seconds whenever it loads it.
     """
     assembler = ptxas() if is_assembled else None
     key = machine.digest("\0".join((TRIPLE, str(capability), PTX, *PASSES, str(LEVEL), _version(assembler), text)))
@@ -41,7 +41,7 @@ def compile_kernel(text: str, capability: tuple[int, int], is_assembled: bool = 
 
 
 def ptx(text: str, capability: tuple[int, int] = NEWEST) -> str:
-    """Compile to PTX."""
+    """Return the PTX of LLVM's text of a kernel, for a compute capability and later ones."""
     llvm = machine.llvm_for_all_targets()
     compiler = llvm.Target.from_triple(TRIPLE).create_target_machine(cpu=_name(capability), features=PTX, opt=LEVEL)
     with machine.optimized(text, compiler, TRIPLE, PASSES) as module:
@@ -53,7 +53,7 @@ def _name(capability: tuple[int, int]) -> str:
 
 
 def assemble(code: str, capability: tuple[int, int], assembler: str) -> bytes:
-    """Assemble PTX to a cubin for a compute capability."""
+    """Return the cubin of PTX for a compute capability, assembled by the program at the path `assembler`."""
     with tempfile.TemporaryDirectory() as folder:
         source, result = Path(folder, "kernel.ptx"), Path(folder, "kernel.cubin")
         source.write_text(code)
@@ -66,7 +66,7 @@ def assemble(code: str, capability: tuple[int, int], assembler: str) -> bytes:
 
 @cache
 def ptxas() -> str | None:
-    """Return the path of NVIDIA's assembler: from a wheel (which JAX installs), an installed CUDA, or the path; else None."""
+    """Return the path of NVIDIA's assembler, of a wheel that JAX installs, of an installed CUDA, or on PATH; None without one."""
     spec, homes = find_spec("nvidia"), [os.environ.get("CUDA_HOME"), "/usr/local/cuda"]
     for wheels in spec.submodule_search_locations or () if spec else ():
         homes = [f"{wheels}/cu13", f"{wheels}/cuda_nvcc", *homes]

@@ -37,9 +37,10 @@ NO_MEMORY = b"no memory for a computation by machine code"
 
 
 def handler(module: Memory, name: str) -> list[Function]:
-    """Write the handler `name(frame)` and its helpers; return the functions, with the handler last.
+    """Return the functions of the handler `name(frame)`, which runs the members of a call: its helpers, then the handler itself.
 
-    Inputs are float64 arrays (1 or members, ...). Outputs are (members, ...); derivatives have the directions as the second axis.
+    In the calls by XLA, inputs are float64 arrays (1 or members, ...). Outputs are (members, ...); derivatives have the
+    directions as their second axis.
     """
     f, count = Function(name, [(POINTER, "frame")], returns="ptr", cold=True), len(module.call_fields)
     frame = f.given["frame"]
@@ -62,7 +63,7 @@ def handler(module: Memory, name: str) -> list[Function]:
 
 
 def call_record(f: Function, frame: Value, module: Memory) -> tuple[Value, Value]:
-    """Write a call record on the stack from the buffers of a frame, all but its last field `next`.
+    """Write a call record on the stack from the buffers of a frame: all fields except the last one, `next`.
 
     Returns:
         The address of the record, and the number of members.
@@ -98,12 +99,12 @@ def call_record(f: Function, frame: Value, module: Memory) -> tuple[Value, Value
 
 
 def word(f: Function, pointer: Value, offset: int, base: str = INT) -> Value:
-    """Load a field of a struct, at an offset in bytes."""
+    """Return the field of a struct at an offset in bytes: an integer of 64 bits or, if `base` is `POINTER`, an address."""
     return f.load(f.at(pointer, offset, "i8"), 0, base=base)
 
 
 def answer_metadata(f: Function, frame: Value):
-    """Return from a handler that is called only for its metadata, with the version of the interface."""
+    """If XLA calls a handler only to ask for its metadata, store the version of the interface, and return from the handler."""
     with f.if_(word(f, frame, EXTENSIONS).is_not(0)):
         metadata = word(f, word(f, frame, EXTENSIONS, POINTER), METADATA, POINTER)
         for offset, number in ((MAJOR, VERSION[0]), (MINOR, VERSION[1])):
@@ -112,7 +113,7 @@ def answer_metadata(f: Function, frame: Value):
 
 
 def call_api(f: Function, frame: Value, function: int, *arguments: Value) -> Value:
-    """Call one of XLA's functions; return its error, or null."""
+    """Call the function of XLA at the offset `function` of its API; return the address of its error, or null."""
     return call_with(f, frame, function, arguments_struct(f, *arguments))
 
 
@@ -125,18 +126,18 @@ def arguments_struct(f: Function, *arguments: Value) -> Value:
 
 
 def call_with(f: Function, frame: Value, function: int, struct: Value) -> Value:
-    """Call one of XLA's functions with a struct of arguments; return its error, or null."""
+    """Call a function of XLA, as `call_api`, with the address of a struct of arguments; return its error's address, or null."""
     address = word(f, word(f, frame, API, POINTER), function, POINTER)
     return f.op(f"call ptr {address.name}(ptr {struct.name})", POINTER)
 
 
 def no_memory(f: Function, frame: Value) -> Value:
-    """Create XLA's error for a computation without memory."""
+    """Return the address of a new error of XLA: there is no memory for a computation."""
     return call_api(f, frame, CREATE_ERROR, text_of(f, NO_MEMORY), f.const(RESOURCE_EXHAUSTED, INT))
 
 
 def text_of(f: Function, characters: bytes, space: int = 0) -> Value:
-    """Return the address of a string on the stack, followed by a zero and by `space` bytes for more."""
+    """Return the address of a copy of a string on the stack, with a zero at its end and `space` further bytes."""
     words = np.frombuffer(characters + bytes(8 - len(characters) % 8), np.int64)
     text = Value(f, f.reserve(INT, len(words) + space // 8), POINTER)
     for k, x in enumerate(words):
@@ -172,7 +173,7 @@ def _leave(f: Function, work: Value):
 
 
 def _help() -> Function:
-    """Write `help(work)`, by which a thread joins a run unless the work is closed."""
+    """Return the function `help(work)`: a thread of the pool calls it to join a run, unless the work is closed."""
     f = Function("help", [(POINTER, "work")], cold=True)
     work = f.given["work"]
     with f.if_(_add(f, work, BEGUN, 1) < CLOSED):
@@ -183,13 +184,13 @@ def _help() -> Function:
 
 
 def _run_shared(f: Function, frame: Value, call: Value, count: int, helpers: Value):
-    """Run the members together with `helpers` threads of the pool."""
+    """Run the members together with `helpers` threads of the pool; without memory for the shared work, run them alone."""
     work = f.op(f"call ptr @malloc(i64 {8 * (CALL + count)})", POINTER)
     f.choose(f.is_null(work), lambda: f.call("run", call), lambda: _share(f, frame, call, count, helpers, work))
 
 
 def _share(f: Function, frame: Value, call: Value, count: int, helpers: Value, work: Value):
-    """Run the members in shared work, as `_run_shared`."""
+    """Set up the memory `work` for `_run_shared`, start the helpers, run members, and wait for the helpers that have started."""
     f.store(helpers + 1, work, USERS, base=INT)
     for k in (BEGUN, ENDED, NEXT, REFUSED):
         f.store(0, work, k, base=INT)

@@ -46,9 +46,11 @@ from udkjax.programs.varying_axes import result_type
 
 
 class HostFunction(Hashable, Protocol):
-    """A function of arrays, each (1 or members, ...); equal functions are compiled once.
+    """A function of arrays, each (1 or members, ...). Equal functions are registered with XLA once.
 
-    Its `description`, if it has one, tells it from others in all processes, so that programs that call it can be stored.
+    A function may have a `description`, a text that differs from those of other functions and is the same in all processes:
+    JAX can then store programs that call the function. It may also have a text `needed_by`: the reason for calling the host, for
+    messages.
     """
 
     def __call__(self, *inputs: Any) -> Sequence[Any]:
@@ -56,17 +58,17 @@ class HostFunction(Hashable, Protocol):
         ...
 
     def shapes(self, members: int) -> Sequence[tuple[int, ...]]:
-        """Return the shapes of the outputs."""
+        """Return the shapes of the outputs for a number of members."""
         ...
 
 
 def call_host(function: HostFunction, inputs: Sequence[Any]) -> list[Array]:
-    """Call a function on arrays that may be traced, with members along the first axis."""
+    """Return the outputs of a function, which the host evaluates; inputs may be traced, and have members along the first axis."""
     return host_p.bind(*(jnp.asarray(x, float) for x in inputs), function=function)
 
 
 def call_seldom(function: Callable[..., Any], *given: Any) -> Any:
-    """Return function(*given), evaluated by NumPy when a program reaches it, instead of compiled; without derivatives.
+    """Return function(*given). In a compiled program NumPy evaluates it on the host when it is reached; it has no derivatives.
 
     For rarely executed parts of programs that would take most of the compile time.
 
@@ -84,7 +86,7 @@ def call_seldom(function: Callable[..., Any], *given: Any) -> Any:
 
 
 class _TracedFunction:
-    """A traced program as a function of arrays, evaluated by NumPy one member after another."""
+    """A program of JAX as a `HostFunction`, which NumPy evaluates for one member after another."""
 
     def __init__(self, program: Any):
         self._program = program
@@ -106,7 +108,7 @@ class _TracedFunction:
         return [np.stack(x) for x in zip(*results, strict=True)]
 
     def shapes(self, members: int) -> Sequence[tuple[int, ...]]:
-        """Return the shapes of the results."""
+        """Return the shapes of the results for a number of members."""
         return [(members, *aval.shape) for aval in self._program.out_avals]
 
     def _of_member(self, inputs: Sequence[Any]) -> list[Any]:
@@ -128,7 +130,7 @@ def _abstract_eval(*inputs: Any, function: HostFunction) -> list[Any]:
 
 
 def _batch(inputs: Sequence[Any], axes: Sequence[int | None], function: HostFunction) -> tuple[list[Array], list[int]]:
-    """Bind a batch as more members; return the results and their batch axes."""
+    """Call a function for a batch, whose elements become further members; return the results and their batch axes."""
     size = next(x.shape[axis] for x, axis in zip(inputs, axes, strict=True) if axis is not None)
     members = max(x.shape[0] if axis is None else np.delete(x.shape, axis)[0] for x, axis in zip(inputs, axes, strict=True))
 
@@ -143,18 +145,18 @@ def _batch(inputs: Sequence[Any], axes: Sequence[int | None], function: HostFunc
 
 
 def _lower(*inputs: Any, function: HostFunction) -> Sequence[Array]:
-    """Lower for the CPU."""
+    """Lower a call for the CPU: XLA calls the handler of the function."""
     return jax.ffi.ffi_call(_target(function).name, _result_shapes(inputs, function))(*inputs)
 
 
 def _lower_for_card(*inputs: Any, function: HostFunction) -> Sequence[Array]:
-    """Lower for an NVIDIA graphics card."""
+    """Lower a call for NVIDIA's graphics cards: a handler copies the arrays to the host and back (gpu/host_handler.py)."""
     name = host_handler.register(*_target(function))
     return jax.ffi.ffi_call(name, _result_shapes(inputs, function))(*inputs)
 
 
 def _lower_for_others(*inputs: Any, function: HostFunction) -> Sequence[Array]:
-    """Lower for all other devices: JAX calls the function."""
+    """Lower a call for all other devices: JAX calls the function."""
     call = lambda *arrays: _evaluate(*map(np.asarray, arrays), function=function)  # noqa: E731
     return jax.pure_callback(call, _result_shapes(inputs, function), *inputs)
 
@@ -164,7 +166,7 @@ def _result_shapes(inputs: Sequence[Any], function: HostFunction) -> list[jax.Sh
 
 
 class _Target(NamedTuple):
-    """A function of Python as a target of XLA."""
+    """A Python function that is registered as an FFI target of XLA."""
 
     name: str  # unique in this process; functions of equal descriptions have the same name in each, which stored programs call
     handler: int  # its address
@@ -172,7 +174,7 @@ class _Target(NamedTuple):
 
 @lru_cache(maxsize=256)
 def _target(function: HostFunction) -> _Target:
-    """Register a function with XLA as the target of custom calls."""
+    """Return a function as a target of custom calls; the first call for equal functions registers it with XLA."""
 
     @ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)
     def handle(frame: int) -> int | None:
@@ -199,7 +201,7 @@ def _target(function: HostFunction) -> _Target:
 
 
 def _name(function: HostFunction) -> str:
-    """Return the name of a function: JAX finds a program that it has stored by the program's text, which contains the name."""
+    """Return a new name for a function, by its description: JAX finds stored programs by their text, which contains the name."""
     text = f"{type(function).__name__} {getattr(function, 'description', '')} {function.shapes(1)}"
     digest = hashlib.sha256(re.sub("0x[0-9a-f]+", "", text).encode()).hexdigest()[:32]  # without addresses of this process
     with _LOCK:
@@ -213,7 +215,7 @@ _NEEDED_BY: dict[str, str] = {}
 
 
 def needed_by(name: str) -> str:
-    """Return the reason why a program calls the function with this name in XLA, with the cure; "" if it is unknown."""
+    """Return the reason why programs call the function of this name in XLA, with the cure, for messages; "" if unknown."""
     return _NEEDED_BY.get(name, "")
 
 
@@ -226,7 +228,7 @@ def _words(address: int, count: int) -> list[int]:
 
 
 def _buffers(block: int) -> list[np.ndarray]:
-    """Return the arrays of the arguments, or of the results, of a frame."""
+    """Return the arrays in a block of a frame of XLA: of its arguments, or of its results. They share XLA's memory."""
     return [_array(buffer) for buffer in _words(_word(block + BUFFERS), _word(block + COUNT))]
 
 

@@ -1,4 +1,4 @@
-"""Deferred programs (programs/deferred.py) in programs of devices other than the CPU: one call of the host.
+"""Deferred programs (programs/deferred.py) within programs for devices other than the CPU: each becomes a call of the host.
 
 On a graphics card each operation of a program takes microseconds to begin, each step of a loop waits for the host, and each
 factorization of a small matrix takes a large part of a millisecond. Deferred programs with loops over small arrays, or with a few
@@ -34,9 +34,9 @@ FEW_MATRICES = 64  # the host takes some 10 us for each factorization, a card ha
 
 
 class HostProgram:
-    """A program compiled for the CPU, as a function of one vector of numbers whose result is one vector.
+    """A program compiled for the CPU, as a `HostFunction` of one vector that holds all inputs; its result is one vector, too.
 
-    Each array that is copied from or to a card takes some 10 us.
+    Several arrays would take longer: each that is copied from or to a card takes some 10 us.
     """
 
     def __init__(self, program: Any):
@@ -48,17 +48,17 @@ class HostProgram:
         return str(self._program)
 
     def __call__(self, *inputs: Any) -> Sequence[Any]:
-        """Run the program in a thread of XLA; nothing is traced or compiled here."""
+        """Return the packed results for packed inputs. A thread of XLA calls this, in which nothing may be traced or compiled."""
         with jax.transfer_guard("allow"), jax.debug_nans(False):
             return [np.asarray(self.compiled(inputs[0][0]))[None]]
 
     def shapes(self, members: int) -> Sequence[tuple[int, ...]]:
-        """Return the shape of the result; the members of a batch are within the program."""
+        """Return the shape of the result. The program is called for one member: batches are axes of its arrays."""
         return [(members, sum(map(_word_count, self._program.out_avals)))]
 
     @cached_property
     def compiled(self) -> Any:
-        """The compiled program."""
+        """The compiled function of a packed vector."""
         place = SingleDeviceSharding(cpu_device())
         size = sum(map(_word_count, self._program.in_avals))
         with jax.default_device(cpu_device()):
@@ -70,12 +70,12 @@ class HostProgram:
 
 @lru_cache(maxsize=256)
 def host_program(program: Any) -> HostProgram:
-    """Return the function that runs a program, the same for each program around it."""
+    """Return the host's function that runs a program; all programs that contain it share one object."""
     return HostProgram(program)
 
 
 def runs_on_host(program: Any) -> bool:
-    """Return True if the host runs the program for other devices."""
+    """Return True if, in programs for other devices than the CPU, a deferred program is to run on the host."""
     avals = [*program.in_avals, *program.out_avals]
     return (
         jax.config.jax_enable_x64
@@ -100,7 +100,7 @@ def _is_slow(jaxpr: Any) -> bool:
 
 
 def _largest(jaxpr: Any) -> int:
-    """Return the size of the largest result of an operation."""
+    """Return the size of the largest result of the operations of a jaxpr; zero without operations."""
     return max((getattr(v.aval, "size", 0) for equation in jaxpr.eqns for v in equation.outvars), default=0)
 
 
@@ -117,7 +117,7 @@ def _word_count(aval: Any) -> int:
 
 
 def pack(xs: Sequence[Array]) -> Float[Array, "N"]:
-    """Return the numbers of arrays as one vector of float64, without loss."""
+    """Return the numbers of arrays of any type, one after another, as a vector of float64, from which `unpack` restores them."""
     return jnp.concatenate([jnp.zeros(0), *(_words(x) for x in xs)])
 
 
@@ -131,7 +131,7 @@ def _words(x: Array) -> Float[Array, "N"]:
 
 
 def unpack(words: Float[Array, "N"], avals: Sequence[Any]) -> list[Array]:
-    """Return the arrays of `pack`, which have the given shapes and dtypes."""
+    """Return the arrays from which `pack` has made a vector; `avals` have their shapes and dtypes."""
     ends = np.cumsum([0, *map(_word_count, avals)])
     return [_array(words[a:b], aval) for a, b, aval in zip(ends, ends[1:], avals, strict=False)]
 
@@ -169,6 +169,6 @@ def _lower(context: Any, *inputs: Any, call_jaxpr: Any) -> Any:
 
 
 def register() -> None:
-    """Register the rule of lowering."""
+    """Register the rule by which JAX lowers deferred programs."""
     if deferred_p is not None:
         mlir.register_lowering(deferred_p, _lower, cacheable=False)

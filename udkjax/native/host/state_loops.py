@@ -1,4 +1,4 @@
-"""Programs of loops at states by machine code, for questions that Python asks again and again.
+"""Loop programs evaluated at states by machine code, for functions that Python calls again and again.
 
 A program is one function of two addresses: the constants of a mechanism, and a block of memory with all other arrays. For single
 states it is compiled quickly, since a run takes a microsecond; for many, in lanes and with optimization.
@@ -27,7 +27,7 @@ _ROUNDED = r"\1.product = fmul double \2, \3\n  \1 = fadd double \1.product, \4"
 
 
 class StateLoops:
-    """A program of loops as a function of its constants and of the arrays that describe a state.
+    """A loop program as machine code: a function of its constants and of the arrays that describe one state.
 
     Args:
         program: the program.
@@ -52,7 +52,7 @@ class StateLoops:
         self._results = [(name, slice(*ends[k : k + 2])) for k, name in enumerate(results)]
 
     def __call__(self, constants: int, given: Mapping[str, np.ndarray | float]) -> dict[str, np.ndarray]:
-        """Return the results for the address of the constants, in float64, and arrays by name."""
+        """Return the results by name, for the address of float64 constants and for the arrays `given` by name."""
         views = self._views
         with self._lock:
             for name, x in given.items():
@@ -63,7 +63,7 @@ class StateLoops:
 
 
 class LoopsAtMany:
-    """A program of loops as a function of its constants and of the arrays that describe states, in lanes.
+    """A loop program as machine code in lanes: a function of its constants and of the arrays that describe many states.
 
     Args:
         program: the program.
@@ -103,7 +103,7 @@ class LoopsAtMany:
         return f
 
     def __call__(self, constants: np.ndarray, given: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """Return the results (..., T) for constants, in float64, and arrays (..., T) or (..., 1) by name."""
+        """Return the results (..., T) by name, for float64 constants and the arrays `given`, (..., T) or (..., 1), by name."""
         count = max(x.shape[1] for x in given.values())
         blocks = -(-count // self._width)
         states, found = (np.empty((_count(rows), blocks * self._width)) for rows in (self._given, self._results))
@@ -116,7 +116,7 @@ class LoopsAtMany:
 
 
 def _rows_of(sizes: Mapping[str, int]) -> dict[str, slice]:
-    """Return the rows of arrays that stand below each other."""
+    """Return the range of rows of each array in a matrix in which arrays of these sizes stand below each other."""
     ends = [0, *accumulate(sizes.values())]
     return {name: slice(*rows) for name, rows in zip(sizes, pairwise(ends), strict=True)}
 
@@ -129,7 +129,7 @@ Compiled = TypeVar("Compiled")
 
 
 def _if_supported(compiler: Callable[..., Compiled]) -> Callable[..., Compiled | None]:
-    """Return a compiler that returns None for a program which machine code cannot hold."""
+    """Return the compiler changed to return None for a program that machine code does not support."""
 
     def compiled(*arguments: Any) -> Compiled | None:
         try:
@@ -141,5 +141,5 @@ def _if_supported(compiler: Callable[..., Compiled]) -> Callable[..., Compiled |
 
 
 def register() -> None:
-    """Let programs of loops be compiled that Python runs often."""
+    """Register the compilers of loop programs, `StateLoops` and `LoopsAtMany`, for programs that Python runs often."""
     compile_by(_if_supported(StateLoops), _if_supported(LoopsAtMany))

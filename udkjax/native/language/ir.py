@@ -1,7 +1,8 @@
 """A thin layer over LLVM's text: values with operators, variables, loops and branches.
 
-A `Function` is written once for one state or for W states in SIMD lanes: wide values are vectors of W lanes, or plain numbers if
-W is one; numbers are broadcast to wide values. All lanes take the same branch, which is taken if
+A `Function` is a function of LLVM's text, to which its methods append instructions; docstrings describe the effect of these
+instructions when the function runs. The same calls write it for one state or for W states in SIMD lanes: wide values are vectors
+of W lanes, or plain numbers if W is one; numbers are broadcast to wide values. All lanes take the same branch, which is taken if
 `any_of` the lanes needs it; lanes differ only by `select`.
 """
 
@@ -26,7 +27,7 @@ SHARED_SPACE, LOCAL_SPACE = 3, 5  # of the memory of a block and of one thread, 
 
 
 class Variable:
-    """A mutable value; LLVM keeps it in a register if it can."""
+    """A variable of a function, read and assigned by `value`; LLVM keeps it in a register if it can."""
 
     def __init__(self, f: "Function", base: str, width: int):
         self.f, self.base, self.width = f, base, width
@@ -42,14 +43,22 @@ class Variable:
         self.f.line(f"store {new.type} {new.name}, ptr {self.place}")
 
     def where(self, mask: Value, new: Operand):
-        """Assign a value in the lanes of `mask`."""
+        """Assign `new` in the lanes in which `mask` is true; other lanes keep their values."""
         self.value = self.f.select(mask, self.f.like(new, self.base, self.width), self.value)
 
 
 class Function:
-    """A function with its `name` and `arguments`, pairs of base type and name.
+    """A function of LLVM's text, to which methods append instructions.
 
-    A `cold` function is not optimized: LLVM's optimizations would take longer than they save.
+    Methods that compute something return a `Value`: the name of the result in the text.
+
+    Args:
+        name: The name of the function.
+        arguments: The base type (`DOUBLE`, `POINTER`, ...) and the name of each argument. The argument x is the value `given[x]`.
+        width: The number of lanes W.
+        returns: The type of the result in LLVM's text.
+        cold: Whether the function is so rarely called that it is not optimized: LLVM's optimizations would take longer than
+            they save.
     """
 
     def __init__(
@@ -82,12 +91,13 @@ class Function:
         return name
 
     def text(self, local: Collection[str] | None = None) -> str:
-        """Return the definition; the LLVM intrinsics that it calls are in `declared`.
+        """Return the definition of this function in LLVM's text; `declared` has the declarations of the intrinsics that it calls.
 
         Args:
-            local: For the thread of a GPU, the names of the arguments that point to its own memory; empty to run it on this
-                processor. Each pointer is cast once to its address space, which LLVM then infers for the addresses computed from
-                it. Functions are not inlined, as each copy would take room in the instruction cache.
+            local: None for a function of the CPU. For a function that each thread of a GPU runs, the names of the arguments that
+                point to the thread's own memory; empty if there are none, or to run such a function on this processor. Each of
+                these pointers is cast once to its address space, which LLVM then infers for the addresses computed from it. The
+                function is not inlined, as each copy would take room in the instruction cache.
         """
         casts, names = [], {n: n for _, n in self._arguments}
         for base, n in self._arguments:
@@ -116,7 +126,7 @@ class Function:
         return Value(self, digits if width == 1 else f"<{', '.join([f'{base} {digits}'] * width)}>", base, width)
 
     def like(self, x: Operand, base: str, width: int) -> Value:
-        """Return a value or a number as `width` lanes of a type."""
+        """Return `x` with the base type `base` in `width` lanes: numbers become constants, single values are repeated."""
         if not isinstance(x, Value):
             return self.const(x, base, width)
         if x.base == INT and base == DOUBLE:
@@ -129,7 +139,7 @@ class Function:
         return x if x.width == width else self.repeat(x, width)
 
     def repeat(self, x: Value, width: int) -> Value:
-        """Repeat a number in all lanes."""
+        """Return a value of one lane repeated in `width` lanes."""
         if x.width != 1:
             raise TypeError(f"{x.width} lanes for {width}")
         if width == 1:
@@ -148,7 +158,7 @@ class Function:
         return self.like(a, base, width), self.like(b, base, width)
 
     def arithmetic(self, kind: str, a: Operand, b: Operand) -> Value:
-        """Add, subtract, multiply or divide.
+        """Return the sum, difference, product or quotient of two operands, as `kind` is "add", "sub", "mul" or "div".
 
         A product in a sum is fused to a multiply-add here and not by LLVM, whose optimization levels would round differently.
         """
@@ -196,7 +206,7 @@ class Function:
         return self.op(f"call {kind} @{full}({', '.join(f'{kind} {v.name}' for v in values)})", DOUBLE, width)
 
     def fma(self, a: Operand, b: Operand, c: Operand) -> Value:
-        """Return a b + c, rounded once if the processor has such an instruction; never by a library call."""
+        """Return a b + c, rounded once if the processor has fused multiply-add, else twice; never by a library call."""
         return self.intrinsic("fmuladd", a, b, c)
 
     def abs(self, a: Value) -> Value:
@@ -220,7 +230,7 @@ class Function:
         return self._halved(x, self.max)
 
     def total(self, x: Value) -> Value:
-        """Return the sum of all lanes: of halves, as long as there are several lanes."""
+        """Return the sum over lanes: both halves of the lanes are added until one lane is left."""
         return self._halved(x, lambda a, b: a + b)
 
     def _halved(self, x: Value, join: Callable[[Value, Value], Value]) -> Value:
@@ -237,7 +247,7 @@ class Function:
         return x
 
     def reduce(self, name: str, x: Value) -> Value:
-        """Reduce all lanes to one value: `or` and `and` of conditions."""
+        """Return all lanes joined to one value by the reduction `name` of LLVM, for example "or" of conditions."""
         if x.width == 1:
             return x
         full = f"llvm.vector.reduce.{name}.v{x.width}{'f64' if x.base == DOUBLE else x.base}"
@@ -251,7 +261,7 @@ class Function:
         return self.reduce("and", mask)
 
     def lane(self, x: Value, k: Value) -> Value:
-        """Return the number in one lane."""
+        """Return the number in lane k."""
         if x.width == 1:
             return x
         return self.op(f"extractelement {x.type} {x.name}, i64 {k.name}", x.base)
@@ -272,7 +282,7 @@ class Function:
         return self.op(f"getelementptr {stored}, ptr {name}, i64 {index.name}", POINTER)
 
     def distance(self, pointer: Value, other: Value) -> Value:
-        """Return the index of the number at another pointer, relative to a pointer."""
+        """Return the number of 8-byte words from the address `pointer` to the address `other`."""
         first, last = (self.op(f"ptrtoint ptr {x.name} to i64", INT) for x in (pointer, other))
         return self.op(f"ashr exact i64 {(last - first).name}, 3", INT)
 
@@ -291,7 +301,10 @@ class Function:
         return variable
 
     def evaluate(self, function: "Function", *arguments: Value) -> Value:
-        """Call a function that returns numbers in as many lanes as its arguments have."""
+        """Return the result of a function: float64 numbers, in as many lanes as its arguments have.
+
+        The module that contains this function has to define the called one, too (`with_evaluated`).
+        """
         self.evaluated[function.name] = function
         given = ", ".join(f"{a.type} {a.name}" for a in arguments)
         return self.op(f"call {function.returns} @{function.name}({given})", DOUBLE, arguments[0].width)
@@ -309,13 +322,13 @@ class Function:
         return self.op(f"ptrtoint ptr {pointer.name} to i64", INT).is_(0)
 
     def leave(self, result: str = "void"):
-        """Write a return; only branches that pass it reach the text that follows."""
+        """Return from the function. Instructions that follow in the same block are never reached."""
         self.line(f"ret {result}")
         self.line(f"{self._label('after')}:")
 
     @contextmanager
     def if_(self, condition: Value) -> Iterator[None]:
-        """Run the block if a condition holds."""
+        """Run the code written in the `with` block if a condition (in one lane) holds."""
         then, end = self._label("then"), self._label("end")
         self.line(f"br i1 {condition.name}, label %{then}, label %{end}")
         self.line(f"{then}:")
@@ -324,7 +337,7 @@ class Function:
         self.line(f"{end}:")
 
     def choose(self, condition: Value, then: Callable[[], None], otherwise: Callable[[], None]):
-        """Run one of two blocks."""
+        """Run the code that `then()` writes if a condition holds, otherwise the code that `otherwise()` writes."""
         yes, no, end = self._label("then"), self._label("else"), self._label("end")
         self.line(f"br i1 {condition.name}, label %{yes}, label %{no}")
         for label, do in ((yes, then), (no, otherwise)):
@@ -335,7 +348,7 @@ class Function:
 
     @contextmanager
     def while_(self, condition: Callable[[], Value]) -> Iterator[None]:
-        """Run the block while a condition holds; it is tested before each iteration."""
+        """Run the code written in the `with` block while `condition()` holds, which is evaluated before each iteration."""
         head, body, end = self._label("while"), self._label("do"), self._label("end")
         self.line(f"br label %{head}")
         self.line(f"{head}:")
@@ -347,7 +360,7 @@ class Function:
 
     @contextmanager
     def each(self, end: Operand, start: Operand = 0) -> Iterator[Value]:
-        """Run the block for every integer from `start` to `end` - 1."""
+        """Run the code written in the `with` block for every integer from `start` to `end` - 1; yield this integer."""
         k = self.variable(start, INT, 1)
         last = self.like(end, INT, 1)
         with self.while_(lambda: k.value < last):

@@ -10,7 +10,15 @@ from udkjax.native.language.program import PointerPlace, Writer, from_memory
 
 
 class LoopWriter:
-    """The functions of loop programs in one module; programs share the functions of kernels."""
+    """The writer of loop programs as functions of one module.
+
+    `functions` has all functions: one for each program, and one for each kernel, which programs share. `globals` has the
+    definitions of tables.
+
+    Args:
+        width: The number of lanes of the module.
+        cold: Whether the functions are not optimized.
+    """
 
     def __init__(self, width: int, cold: bool = False):
         self.width, self._cold = width, cold
@@ -21,7 +29,7 @@ class LoopWriter:
 
     @property
     def parts(self) -> tuple[list[Function], list[Function]]:
-        """The functions of programs, and those of their kernels."""
+        """The functions of programs, and the functions of the kernels that these call."""
         kernels = {*self._kernels.values()}
         return [f for f in self.functions if f.name not in kernels], [f for f in self.functions if f.name in kernels]
 
@@ -33,8 +41,9 @@ class LoopWriter:
         Args:
             program: The program.
             name: The function's name.
-            pointers: The names of its arguments.
-            at: The beginning of each array: a pointer and an index relative to it.
+            pointers: The names of the function's arguments.
+            at: The place of each array of the program: the pointer to its memory, and its offset there in units of `width`
+                numbers.
             width: The number of lanes; by default that of the module.
         """
         width = width or self.width
@@ -62,7 +71,7 @@ class LoopWriter:
         return self._kernels[key]
 
     def _write_result(self, kernel: Kernel, columns: int, width: int, name: str) -> Function:
-        """Write `name(arrays..., table, count)` for a table of `columns` columns."""
+        """Return the function `name(arrays..., table, count)`: it runs a kernel for each row of a table of `columns` columns."""
         f = Function(name, [*((POINTER, a) for a in kernel.arrays), (POINTER, "table"), (INT, "count")], width, cold=self._cold)
         f.noinline = True  # inlined copies in each program would multiply the time of compilation
         with f.each(f.given["count"]) as i:

@@ -1,4 +1,4 @@
-"""Powers of numbers in lanes without library calls, for step sizes, which need not be exact to the last digit."""
+"""Powers of numbers in lanes, without library calls and to some nine digits, which suffice for the choice of step sizes."""
 
 import math
 

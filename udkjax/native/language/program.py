@@ -52,10 +52,21 @@ def write(
     lanes: Mapping[str, int] | None = None,
     longest: int = LONGEST,
 ) -> Function:
-    """Write a program as a function of some pointers; conditions are stored as one or zero.
+    """Return a function of some pointers that computes a program; conditions are stored as one or zero.
 
-    `lanes` has the widths of pointers to numbers of another width; results that depend only on single numbers are computed once.
-    A program of more than `longest` operations is a function that calls its pieces, one after another.
+    A long program is cut into pieces, functions of their own, which the returned function calls one after another.
+
+    Args:
+        program: The program.
+        name: The name of the function.
+        width: The number of lanes.
+        pointers: The names of the function's arguments.
+        inputs: The place of each input of the program.
+        outputs: The place of each output. The index of a place is in units of the lanes of its pointer.
+        cold: Whether the function is not optimized.
+        lanes: By pointer, the number of lanes of the numbers there, if it is not `width`. Operations whose operands have one lane
+            are computed in one lane.
+        longest: The maximum number of operations of a function.
     """
     lanes = dict.fromkeys(pointers, width) | dict(lanes or {})
     places = {s.index: place for s, place in zip(program.inputs, inputs, strict=True) if program.uses(s)}
@@ -101,20 +112,24 @@ def write(
 
 
 def vector_function(program: ScalarProgram, name: str, given: str, found: str, places: Sequence[int] | None = None) -> Function:
-    """Return a function of two pointers: contiguous inputs at `given`, outputs at `places` of `found`, by default contiguous."""
+    """Return a function of one lane that computes a program, with two pointers as its arguments.
+
+    The argument named `given` points to the inputs, which are contiguous, and that named `found` to the outputs. `places` has the
+    indices of the outputs there; by default they are contiguous, too.
+    """
     outputs = consecutive(found, len(program.outputs)) if places is None else [(found, k) for k in places]
     return write(program, name, 1, (given, found), consecutive(given, len(program.inputs)), outputs)
 
 
 def from_memory(f: Function, x: Value, dtype: Any) -> Value:
-    """Convert a number from memory to its type in the graph."""
+    """Return a float64 number from memory as a value of a type of the program: a condition, an integer, or the same number."""
     if dtype.kind == "b":
         return x.is_not(0.0)
     return f.op(f"fptosi {x.type} {x.name} to {llvm_type(INT, x.width)}", INT, x.width) if dtype.kind in "iu" else x
 
 
 def nodes_read_again(program: ScalarProgram) -> set[int]:
-    """Return the nodes that are read more than once, by operations or as outputs."""
+    """Return the indices of the nodes of a program that are read more than once, by operations or as outputs."""
     nodes = program.graph.nodes
     read, again = set[int](), set[int]()
     for s in chain(chain.from_iterable(nodes[index].arguments for index in program.order), program.outputs):
@@ -123,9 +138,14 @@ def nodes_read_again(program: ScalarProgram) -> set[int]:
 
 
 class Writer:
-    """The operations of a program within a function; the values of inputs must be set in `values` first.
+    """The writer of a program's operations into a function.
 
-    `read_again` may be the nodes that are read more than once, where several writers write one program.
+    `values` has the value of each node that is known, by index. The caller must enter those of the inputs first.
+
+    Args:
+        f: The function.
+        program: The program.
+        read_again: The result of `nodes_read_again`, if it is known: several writers may write parts of one program.
     """
 
     def __init__(self, f: Function, program: ScalarProgram, read_again: Collection[int] | None = None):
@@ -135,7 +155,7 @@ class Writer:
         self._pairs: dict[str, tuple[Value, Value]] = {}
 
     def run(self) -> list[Value]:
-        """Write all operations; return the outputs."""
+        """Write all operations of the program; return the values of its outputs."""
         self.compute(self.program.order)
         return self.outputs(range(len(self.program.outputs)))
 
@@ -144,7 +164,7 @@ class Writer:
         return nodes_read_again(self.program) if self._given is None else self._given
 
     def compute(self, order: Sequence[int]) -> None:
-        """Write some operations."""
+        """Write the operations of the nodes `order`."""
         nodes = self.program.graph.nodes
         for index in order:
             self.values[index] = result = self._operation(nodes[index])
@@ -152,7 +172,7 @@ class Writer:
                 result.product = None
 
     def outputs(self, chosen: Iterable[int]) -> list[Value]:
-        """Return the outputs with these indices, whose nodes have been written."""
+        """Return the values of the `chosen` outputs (indices), whose nodes have been written."""
         return [self._with_sign(self.program.outputs[k]) for k in chosen]
 
     def check(self):
@@ -196,7 +216,18 @@ class Writer:
 
 
 def apply(f: Function, name: str, parameters: Mapping[str, Any], a: list[Value], pair: Any) -> Value:
-    """Apply one of JAX's primitives to numbers."""
+    """Return the result of a primitive of JAX, applied lane by lane.
+
+    Args:
+        f: The function to write to.
+        name: The name of the primitive.
+        parameters: Its parameters.
+        a: Its operands.
+        pair: A function that returns the sine and the cosine of an angle.
+
+    Raises:
+        UnsupportedError: machine code does not support the primitive.
+    """
     match name:
         case "sin" | "cos":
             return pair(a[0])[name == "cos"]
@@ -283,7 +314,7 @@ def _convert(f: Function, a: Value, dtype: Any) -> Value:
 
 
 def _truncate(f: Function, a: Value, dtype: np.dtype) -> Value:
-    """Return the integer part, clipped to the range of the type; zero for NaN."""
+    """Return the integer part of numbers, clipped to the range of an integer type `dtype`; zero for NaN."""
     bounds = np.iinfo(dtype)
     kind, of_double = llvm_type(INT, a.width), f"{'v' + str(a.width) if a.width > 1 else ''}f64"
     full = f"llvm.fpto{'u' if dtype.kind == 'u' else 's'}i.sat.{of_double.replace('f', 'i')}.{of_double}"
@@ -296,14 +327,17 @@ def _truncate(f: Function, a: Value, dtype: np.dtype) -> Value:
 
 
 def _divide_whole(f: Function, name: str, x: Value, y: Value) -> Value:
-    """Return the quotient of integers, rounded towards zero, or the remainder; division by zero is as in JAX, without a trap."""
+    """Return the quotient of integers, rounded towards zero, if `name` is "div", else the remainder.
+
+    Division by zero does not trap, and has the result that it has in JAX.
+    """
     is_zero, is_minus = y.is_(0), y.is_(-1)
     ratio = f.select(is_minus, 0 - x, f.arithmetic("div", x, f.select(is_zero | is_minus, 1, y)))
     return f.select(is_zero, -1, ratio) if name == "div" else f.select(is_zero, x, x - ratio * y)
 
 
 def _round(f: Function, a: Value, method: Any) -> Value:
-    """Round to an integer; halves to the even one, or away from zero."""
+    """Round to an integer: halves to the even one if JAX's rounding `method` is 1, else away from zero."""
     if int(method) == 1:
         return f.intrinsic("roundeven", a)
     below_half = f.intrinsic("copysign", math.nextafter(0.5, 0.0), a)  # half itself would round up the number below one half

@@ -1,4 +1,4 @@
-"""The text of a module from its functions, and the functions outside that it calls."""
+"""The text of a module, made of its functions, and the external functions that it calls."""
 
 import re
 from collections.abc import Collection, Iterable, Sequence
@@ -27,7 +27,7 @@ INSTRUCTIONS = frozenset(
 
 
 def with_evaluated(functions: Iterable[Function]) -> list[Function]:
-    """Return functions, and the functions that they evaluate."""
+    """Return functions, followed by all functions in their `evaluated`, which they call and which their module has to define."""
     functions, evaluated = list(functions), {}
     for f in functions:
         evaluated |= f.evaluated
@@ -41,14 +41,14 @@ def text_of_module(
     local: Collection[str] | None = None,
     shared: Sequence[Function] = (),
 ) -> str:
-    """Return the text of a module of functions, and of the functions that they evaluate.
+    """Return the text of a module that defines functions and all functions in their `evaluated`.
 
     Args:
         functions: The functions.
         globals: Definitions of constants, one line each.
         declared: Declarations in addition to those of the functions.
         local: For the thread of a GPU, the names of the arguments that point to its own memory (`Function.text`).
-        shared: For the thread of a GPU, functions of pointers to any memory.
+        shared: For the thread of a GPU, further functions, whose arguments may point to any memory.
     """
     functions = list(functions)
     others = with_evaluated([*functions, *shared])[len(functions) :]
@@ -58,18 +58,20 @@ def text_of_module(
 
 
 def apart(names: Iterable[str]) -> str:
-    """Return the line of a module that names functions which are compiled apart from others (machine.py)."""
+    """Return a comment for the text of a module that names the functions to compile apart from all others (machine.py)."""
     return f"; apart {' '.join(sorted(names))}"
 
 
 def named_apart(text: str) -> frozenset[str]:
-    """Return the names of such functions, from the text of a module."""
+    """Return the names of the functions that the text of a module names by `apart`; empty if it has no such comment."""
     found = re.search(r"^; apart (.*)$", text, re.MULTILINE)
     return frozenset(found[1].split()) if found else frozenset()
 
 
 def external_functions(declarations: str) -> frozenset[str]:
-    """Return the names of functions outside a module, from its text or its declarations; instructions are not functions.
+    """Return the names of the functions that a module calls but does not define, from its text or its declarations.
+
+    Intrinsics that LLVM writes as instructions are not among them.
 
     In the engine's modules only functions of memory management are external (malloc, free, realloc). Whoever compiles a
     module for a target without a C library must supply them, or refuse the module.

@@ -8,7 +8,7 @@ Operand = Union["Value", float, int, bool]
 
 
 def literal(number: Any, base: str) -> str:
-    """Return a number in LLVM's syntax."""
+    """Return a number as a constant of a base type in LLVM's syntax."""
     if base == DOUBLE:
         return f"0x{struct.unpack('<Q', struct.pack('<d', float(number)))[0]:016X}"
     return str(int(number)) if base != BOOL else str(bool(number)).lower()
@@ -23,7 +23,7 @@ class Product(NamedTuple):
 
 
 class Value:
-    """One value of a function: its name, base type and number of lanes."""
+    """A value in the text of a function `f`: its name, base type and number of lanes."""
 
     __slots__ = ("base", "f", "name", "product", "width")
 
@@ -102,5 +102,5 @@ class Value:
 
 
 def llvm_type(base: str, width: int) -> str:
-    """Return the LLVM type of `width` lanes."""
+    """Return LLVM's name of the type of `width` lanes of a base type."""
     return base if width == 1 else f"<{width} x {base}>"

@@ -15,10 +15,10 @@ Index = tuple[Operand, ...]
 
 
 def base_of(dtype: Any) -> str:
-    """Return the type of numbers in machine code.
+    """Return the base type of machine code (`DOUBLE`, `INT` or `BOOL`) for numbers of a dtype.
 
     Raises:
-        UnsupportedError: there is none.
+        UnsupportedError: machine code has no such numbers.
     """
     if not isinstance(dtype, np.dtype | type):  # the types of random keys
         raise UnsupportedError(f"the type {dtype}")
@@ -33,13 +33,20 @@ def base_of(dtype: Any) -> str:
 
 
 class Array:
-    """An array of one member; `varies` says whether lanes may differ, `cost` how many operations reading an element takes."""
+    """An array of one member.
+
+    Args:
+        shape: The shape of the array.
+        base: The base type of its elements.
+        varies: Whether elements may differ between lanes.
+        cost: The number of operations that reading an element takes.
+    """
 
     def __init__(self, shape: Sequence[int], base: str, varies: bool, cost: int = 0):
         self.shape, self.base, self.varies, self.cost = tuple(shape), base, varies, cost
 
     def read(self, f: Function, index: Index) -> Value:
-        """Return one element, in all lanes if it varies."""
+        """Return the element at an index: in all lanes if the array varies, else in one lane."""
         raise NotImplementedError
 
     @property
@@ -59,7 +66,7 @@ class SingleNumber(Array):
 
 
 class Constant(Array):
-    """Constant numbers; `memory` stores them unless they are all equal."""
+    """An array of known numbers. `memory` stores them as a table, for reads at unknown indices, unless all are equal."""
 
     def __init__(self, numbers: Any, memory: Callable[[np.ndarray], "Stored"]):
         self.numbers, self._memory = np.asarray(numbers), memory
@@ -94,7 +101,7 @@ class Stored(Array):
         self.is_contiguous = self.strides == contiguous
 
     def at(self, pointer: Value) -> "Stored":
-        """Return the same array for another pointer to it."""
+        """Return the same array with another pointer to its memory, for a function in which this has another name."""
         return Stored(pointer, self.shape, self.base, self.varies, self.start, self.strides)
 
     def _place(self, index: Index) -> Operand:
@@ -116,7 +123,7 @@ class Stored(Array):
         return x.is_not(0) if self.base == BOOL else x
 
     def write(self, f: Function, index: Index, x: Value):
-        """Store one element."""
+        """Store x as the element at an index."""
         lanes, base = f.width if self.varies else 1, INT if self.base == BOOL else self.base
         place, x = self._place(index), fit(f, x, self.varies)
         x = f.like(x, base, lanes)
@@ -143,14 +150,14 @@ class Lazy(Array):
 
 
 def fit(f: Function, x: Value, varies: bool) -> Value:
-    """Return a value in all lanes, or one that cannot differ between lanes in one."""
+    """Return x in all lanes if it `varies`, else in one lane."""
     if varies:
         return f.like(x, x.base, f.width)
     return x if x.width == 1 else f.lane(x, f.const(0, INT))
 
 
 def plus(a: Operand, b: Operand) -> Operand:
-    """Add two indices."""
+    """Return the sum of two indices."""
     if isinstance(a, int) and a == 0:
         return b
     return a if isinstance(b, int) and b == 0 else a + b

@@ -1,7 +1,8 @@
-"""Decompositions of small matrices, and sorting, as plain JAX: what is lowered where a jaxpr calls LAPACK or a sort.
+"""Decompositions of small matrices, and sorting, in plain JAX. They are lowered in place of calls of LAPACK and of sorts.
 
-Rotations act on all pairs of a round of Jacobi's methods at once, by products of whole arrays; in a round-robin, each row meets
-each other one once in a sweep. G. H. Golub & C. F. Van Loan, Matrix Computations, 4th ed., sections 5.2.2, 8.5 and 8.6.3.
+Jacobi's methods rotate all pairs of rows of a round at once, by products of whole arrays. The pairs follow a round-robin: in the
+rounds of a sweep, each row meets each other row once. G. H. Golub & C. F. Van Loan, Matrix Computations, 4th ed., sections 5.2.2,
+8.5 and 8.6.3.
 """
 
 from collections.abc import Callable, Sequence
@@ -19,7 +20,7 @@ ROUNDING = np.finfo(float).eps
 def householder_qr(a: Float[Array, "m n"], is_full: bool, pivots: bool = False) -> tuple[Array, Array, Array]:
     """Return Q, R and p of A[:, p] = Q R, with LAPACK's signs; Q is square if it is full.
 
-    With pivots, each column is the longest of the rest.
+    With `pivots`, the next column is always the longest of the remaining ones; without, p is 0, 1, ..., n - 1.
     """
     m, n = a.shape
     i, j, steps = jnp.arange(m), jnp.arange(n), min(m, n)
@@ -46,27 +47,33 @@ def householder_qr(a: Float[Array, "m n"], is_full: bool, pivots: bool = False) 
 
 
 def _with_exchanged(x: Array, k: Array, other: Array) -> Array:
-    """Exchange two columns of a matrix, or two elements; which ones may differ between lanes."""
+    """Return x with columns (or elements) `k` and `other` exchanged; the two indices may differ between lanes."""
     j = np.arange(x.shape[-1])
     of_k, of_other = (jnp.sum(jnp.where(j == c, x, 0), -1, keepdims=True) for c in (k, other))
     return jnp.where(j == k, of_other, jnp.where(j == other, of_k, x))
 
 
 def _exchanged(first: Array, second: Array) -> Array:
-    """Move the players of a round-robin on: row i of both halves has met, and the first row of all stays in its place."""
+    """Return all rows in the order of the next round, in which row i of the first half meets row i of the second half.
+
+    The arguments are the halves of the present round. The first row stays in its place, and the others move on.
+    """
     if len(first) == 1:
         return jnp.concatenate([first, second])
     return jnp.concatenate([first[:1], second[:1], first[1:-1], second[1:], first[-1:]])
 
 
 def _turned(x: Array, c: Array, s: Array) -> Array:
-    """Rotate row i of the first half and row i of the second one, and move all rows on."""
+    """Return the rows after a round: row i of the first half is rotated with row i of the second, then all rows move on."""
     first, second = x[: len(c)], x[len(c) :]
     return _exchanged(c[:, None] * first - s[:, None] * second, s[:, None] * first + c[:, None] * second)
 
 
 def _angles(first: Array, second: Array, product: Array, turns: Array) -> tuple[Array, Array]:
-    """Return cosines and sines of the rotations that make products of pairs zero, where they turn."""
+    """Return the cosines and sines of the rotations of pairs of rows that make their `product` zero.
+
+    `first` and `second` are the squares (or diagonal entries) of the rows. Pairs that are not to be turned have the angle zero.
+    """
     ratio = (second - first) / jnp.where(turns, 2.0 * product, 1.0)
     tangent = jnp.where(turns, jnp.where(ratio < 0, -1.0, 1.0) / (jnp.abs(ratio) + jnp.hypot(1.0, ratio)), 0.0)
     cosine = 1.0 / jnp.sqrt(1.0 + tangent**2)
@@ -74,7 +81,10 @@ def _angles(first: Array, second: Array, product: Array, turns: Array) -> tuple[
 
 
 def _swept(turn: Callable[[Array], tuple[Array, Array]], start: Array) -> Array:
-    """Repeat sweeps, in which all rows meet, until one turns nothing; then rows are in their places again."""
+    """Repeat sweeps of rotations until one turns no pair of rows; return the rows, which are then in their places again.
+
+    `turn` performs one round: it returns the rows, and whether any pair was turned.
+    """
 
     def sweep(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         def one(_: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -91,7 +101,7 @@ def _swept(turn: Callable[[Array], tuple[Array, Array]], start: Array) -> Array:
 
 
 def _places(x: Array) -> Array:
-    """Return the place of each element in ascending order, NaN last, equal ones in their order."""
+    """Return the place of each element of the last axis in ascending order: NaN last, equal elements in their order."""
     n = x.shape[-1]
     one, other = x[..., :, None], x[..., None, :]
     is_less = (other < one) | ((one != one) & (other == other))
@@ -100,13 +110,13 @@ def _places(x: Array) -> Array:
 
 
 def _moved(x: Array, places: Array) -> Array:
-    """Move the elements of the last axis to the given indices."""
+    """Return x with the elements of its last axis moved to the indices `places`."""
     chosen = places[..., None, :] == np.arange(x.shape[-1])[:, None]
     return jnp.sum(jnp.where(chosen, x[..., None, :], jnp.zeros((), x.dtype)), -1).astype(x.dtype)
 
 
 def sorted_along(arrays: Sequence[Array], axis: int, keys: int) -> list[Array]:
-    """Sort arrays along an axis by the first of them, or by the first `keys` in turn; equal elements keep their order."""
+    """Return arrays sorted along an axis by the first `keys` of them, the first one first; equal elements keep their order."""
     moved = [jnp.moveaxis(x, axis, -1) for x in arrays]
     for key in range(keys - 1, -1, -1):
         places = _places(moved[key])
@@ -115,20 +125,22 @@ def sorted_along(arrays: Sequence[Array], axis: int, keys: int) -> list[Array]:
 
 
 def tiled(x: Array, counts: Sequence[int]) -> Array:
-    """Repeat an array along each of its axes."""
+    """Return an array repeated along each of its axes as often as `counts` says."""
     for axis, count in enumerate(counts):
         x = jnp.concatenate([x] * count, axis)
     return x
 
 
 def symmetric(a: Float[Array, "n n"], is_lower: bool) -> Float[Array, "n n"]:
-    """Return the symmetric matrix with the lower or the upper triangle of another one."""
+    """Return the symmetric matrix whose lower triangle is that of `a` if `is_lower`, or else whose upper triangle is."""
     i = np.arange(len(a))
     return jnp.where(i[:, None] >= i if is_lower else i[:, None] <= i, a, a.T)
 
 
 def jacobi_svd(a: Float[Array, "m n"], is_full: bool) -> tuple[Array, Array, Array]:
-    """Return s, U and V^T of A = U diag(s) V^T, s descending, by one-sided rotations of the factor R of A or of A^T.
+    """Return s (descending), U and V^T of A = U diag(s) V^T, by one-sided rotations of the factor R of A or of A^T.
+
+    U and V are square if `is_full`; otherwise they have min(m, n) columns.
 
     Singular vectors are orthonormal for any rank, and each singular value is as accurate as rounding of A permits.
     """

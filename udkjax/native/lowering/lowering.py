@@ -1,7 +1,7 @@
 """The lowering of jaxprs into one function: memory, loops and branches.
 
-Loops that run equally long in all lanes are loops; in others a lane that has ended keeps its state. Of a branch that lanes take
-differently, each result is selected; a branch that no lane takes is not run.
+If a loop may end earlier in some lanes than in others, it runs until it ends in all, and a lane that has ended keeps its state.
+If lanes may take different branches, each branch that any lane takes is run, and its results are selected in these lanes.
 """
 
 import hashlib
@@ -29,15 +29,20 @@ EquationRule = Callable[["Lowering", Any, list[Array]], list[Array]]
 
 
 def traced(function: Callable[..., Any], given: Sequence[jax.ShapeDtypeStruct]) -> Any:
-    """Return the jaxpr of a function, the same within other traces of JAX, outside, and without `jit`: constants are folded."""
+    """Return the jaxpr of a function, with constants folded: the same within other traces of JAX, and where `jit` is disabled."""
     with jax.ensure_compile_time_eval(), jax.disable_jit(False):  # without `jit`, loops would be repeated in the text
         return jax.make_jaxpr(function)(*given)
 
 
 class LoweredFunction(Function):
-    """A function with its constant tables.
+    """A function with its own tables of constants.
 
-    `in_module`: its arguments are the pointer `work` of a module, whose functions it calls, and the places of `pointers` there.
+    Args:
+        name: The name of the function.
+        pointers: The names of its arguments, addresses of arrays.
+        width: The number of lanes.
+        in_module: Whether it can call functions of a module. The arguments are then the pointer `work` to the memory of the
+            module, and indices there in place of `pointers`.
     """
 
     def __init__(self, name: str, pointers: Sequence[str], width: int, in_module: bool = False):
@@ -54,21 +59,21 @@ class LoweredFunction(Function):
 
     @property
     def parts(self) -> tuple[list[str], ...]:
-        """The lines of its text."""
+        """The lines of the function's text, for `of_parts`."""
         return self._lines, self._reserved, self.tables, sorted(self.declared)
 
     @classmethod
     def of_parts(
         cls, name: str, pointers: Sequence[str], width: int, in_module: bool, parts: Sequence[list[str]]
     ) -> "LoweredFunction":
-        """Return a function with the lines of another one, which evaluates none."""
+        """Return a function with the `parts` of a function that calls no lowered functions, for example one from the cache."""
         f = cls(name, pointers, width, in_module)
         f._lines, f._reserved, f.tables, declared = parts
         f.declared = set(declared)
         return f
 
     def call_in(self, f: Function, *arguments: Value):
-        """Write a call of this function in another, whose module has to define it."""
+        """Call this function in the function `f`, whose module then has to define it."""
         f.evaluated |= self.evaluated | {self.name: self}
         f.call(self.name, *arguments)
 
@@ -79,7 +84,7 @@ class Lowering:
     Args:
         f: The function.
         scratch: The address of its memory; `size` is the number of elements that it takes, each in all lanes.
-        lower: Lowers one equation (`rules.lower`).
+        lower: The function that lowers one equation (`rules.lower`).
     """
 
     def __init__(self, f: LoweredFunction, scratch: Value, lower: EquationRule):
@@ -92,7 +97,7 @@ class Lowering:
         return Constant(numbers, self._table)
 
     def _table(self, numbers: np.ndarray) -> Stored:
-        """Return numbers as constant memory of the module."""
+        """Return an array of numbers in a table of constants of the function, which equal numbers share."""
         base, key = base_of(numbers.dtype), (numbers.tobytes(), str(numbers.dtype))
         if key not in self._tables:
             name, stored = f"@table{len(self._tables)}", DOUBLE if base == DOUBLE else INT
@@ -102,19 +107,19 @@ class Lowering:
         return Stored(self._tables[key], numbers.shape, base, False)
 
     def new(self, shape: Sequence[int], base: str, varies: bool) -> Stored:
-        """Return memory for an array."""
+        """Return an array in new memory, whose elements are not yet set."""
         address = self.f.at(self._scratch, self.size * self.f.width)
         self.size += int(np.prod(shape))
         return Stored(address, shape, base, varies)
 
     def stored(self, x: Array) -> Array:
-        """Return the array with all of its elements computed, in memory."""
+        """Return an array whose elements need no further operations: x itself, or a copy of x in memory."""
         if isinstance(x, SingleNumber | Stored | Constant):
             return x
         return self.copied(x)
 
     def copied(self, x: Array) -> Array:
-        """Return an array in memory of its own."""
+        """Return a copy of an array in new memory; a single number is in registers."""
         if not x.shape:
             return SingleNumber(fit(self.f, x.read(self.f, ()), x.varies), x.varies)
         to = self.new(x.shape, x.base, x.varies)
@@ -122,11 +127,11 @@ class Lowering:
         return to
 
     def fill(self, to: Stored, x: Array):
-        """Compute all elements."""
+        """Compute all elements of x, and store them in the array `to`."""
         self.each(x.shape, lambda index: to.write(self.f, index, x.read(self.f, index)))
 
     def each(self, shape: Sequence[int], do: Callable[[Index], None], index: Index = (), most: int = UNROLLED):
-        """Run `do` for all indices, at most `most` times in the text of a loop."""
+        """Run the code of `do` for all indices of a shape, after `index`; loops over at most `most` indices are unrolled."""
         if not shape:
             do(index)
         elif int(np.prod(shape)) <= most:
@@ -139,7 +144,7 @@ class Lowering:
     # --- jaxprs
 
     def closed(self, closed: Any, given: Sequence[Array]) -> list[Array]:
-        """Lower a jaxpr with its constants."""
+        """Lower a jaxpr with its constants; return its outputs."""
         return self.run(without_constants(closed), [self.constant(c) for c in getattr(closed, "consts", ())], given)
 
     def run(self, jaxpr: Any, constants: Sequence[Array], given: Sequence[Array]) -> list[Array]:
@@ -163,7 +168,7 @@ class Lowering:
     def scan(
         self, body: Any, constants: Sequence[Array], start: Sequence[Array], rows: Sequence[Array], length: int, reverse: bool
     ) -> list[Array]:
-        """Run a loop over the rows of arrays."""
+        """Lower a loop over the rows of arrays (`jax.lax.scan`); return the last states and the stacked outputs."""
         f = self.f
         constants, rows = [self.stored(x) for x in constants], [self.stored(x) for x in rows]
         of_constants, of_rows = [x.varies for x in constants], [x.varies for x in rows]
@@ -183,7 +188,7 @@ class Lowering:
     def while_(
         self, test: Any, body: Any, of_test: Sequence[Array], of_body: Sequence[Array], start: Sequence[Array]
     ) -> list[Array]:
-        """Run a loop while a condition holds in any lane."""
+        """Lower a loop that runs while a condition holds in any lane (`jax.lax.while_loop`); return the last states."""
         f = self.f
         of_test, of_body = [self.stored(x) for x in of_test], [self.stored(x) for x in of_body]
         given = [x.varies for x in of_test], [x.varies for x in of_body], [x.varies for x in start]
@@ -202,7 +207,7 @@ class Lowering:
         return [s.value() for s in states]
 
     def cond(self, which: Array, branches: Sequence[Any], operands: Sequence[Array]) -> list[Array]:
-        """Run the branches that lanes take."""
+        """Lower branches, of which those run that any lane takes (`jax.lax.switch`); return the results."""
         if isinstance(which, Constant):
             return self.closed(branches[min(max(int(which.numbers), 0), len(branches) - 1)], operands)
         f, index, last = self.f, which.read(self.f, ()), len(branches) - 1
@@ -223,11 +228,11 @@ class Lowering:
         return [s.value() for s in states]
 
     def part(self, closed: Any, given: Sequence[Array]) -> list[Array]:
-        """Lower a jaxpr with its constants, a long one as a function of its own."""
+        """Lower a jaxpr with its constants, as a function of its own if it is long; return its outputs."""
         return self._apart(closed, given) if operations(closed) > APART else self.closed(closed, given)
 
     def _apart(self, closed: Any, given: Sequence[Array]) -> list[Array]:
-        """Lower a jaxpr as a function of its own, and call it; equal texts are one function."""
+        """Lower a jaxpr as a separate function, and call it; return the outputs. Functions with equal texts are one function."""
         f, in_module = self.f, "work" in self.f.given
         known = [x if isinstance(x, Constant) else self._in_memory(x) for x in given]
         memory = {f"in{k}": x for k, x in enumerate(known) if isinstance(x, Stored)}
@@ -251,7 +256,7 @@ class Lowering:
         return list(outs)
 
     def _in_memory(self, x: Array) -> Stored:
-        """Return an array that has a place in memory."""
+        """Return x itself if it is in memory, else a copy in memory, also for single numbers and constants."""
         x = self.stored(x)
         if isinstance(x, Stored):
             return x
@@ -260,7 +265,7 @@ class Lowering:
         return to
 
     def move(self, states: Sequence["LoopState"], nodes: Sequence[Array], mask: Value | None = None):
-        """Assign new values to all states together, in the lanes of a mask."""
+        """Assign the values `nodes` to all states at once, in the lanes of a mask; None: in all lanes."""
         places = {s.memory.pointer.name for s in states if s.memory is not None}
         known = []
         for x in nodes:
@@ -271,12 +276,12 @@ class Lowering:
 
 
 def operations(jaxpr: Any) -> int:
-    """Return the number of operations of a jaxpr, with those within its loops and branches."""
+    """Return the number of operations of a jaxpr; those within a loop or a branch count once."""
     return sum(1 + sum(map(operations, parts_of(e))) for e in without_constants(jaxpr).eqns)
 
 
 class LoopState:
-    """An array that a loop or a branch changes: a variable for a single number, or memory."""
+    """An array that a loop or a branch assigns: a variable if it is a single number, else memory."""
 
     def __init__(self, to: Lowering, shape: Sequence[int], base: str, varies: bool, start: Array | None = None):
         self._in, self.shape, self.base, self.varies = to, tuple(shape), base, varies
@@ -291,11 +296,11 @@ class LoopState:
             to.fill(self.memory, start)
 
     def value(self) -> Array:
-        """Return the present value."""
+        """Return the present value of the state."""
         return SingleNumber(self._variable.value, self.varies) if self.memory is None else self.memory
 
     def assign(self, x: Array, mask: Value | None = None):
-        """Set the value, in the lanes of a mask."""
+        """Set the value of the state, in the lanes of a mask; None: in all lanes."""
         f, memory = self._in.f, self.memory
         if memory is None:
             new = fit(f, x.read(f, ()), self.varies)
@@ -310,5 +315,5 @@ class LoopState:
 
 
 def row_of(f: Function, x: Array, i: Value) -> Array:
-    """Return one row of an array."""
+    """Return row i of an array, whose elements are read where they are used."""
     return Lazy(x.shape[1:], x.base, [x], lambda index: x.read(f, (i, *index)))

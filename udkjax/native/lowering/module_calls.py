@@ -1,4 +1,4 @@
-"""Calls of functions of a module from a user's text: a primitive of JAX, and its lowering.
+"""Calls of a module's functions from functions of a user that are lowered: a primitive of JAX, and its rule.
 
 Arguments and results are arrays at fixed places in the memory of the module.
 """
@@ -20,7 +20,8 @@ from udkjax.native.lowering.varying import parts_of, without_constants
 class ModuleCall(NamedTuple):
     """A call of functions of a module, one after another.
 
-    If the `first` arguments are those of an earlier call of the same functions, all functions but the last have been called.
+    All functions but the last are preparations, which depend on the `first` arguments alone: if the call before had the same
+    preparations and the same first arguments, they are left out (`simplified`).
     """
 
     functions: tuple[str, ...]
@@ -29,7 +30,7 @@ class ModuleCall(NamedTuple):
     first: int = 0
 
     def __call__(self, *arguments: Any) -> list[JaxArray]:
-        """Return the results, in a text that JAX traces."""
+        """Return the results as traced arrays; this is called in functions that JAX traces."""
         return call_p.bind(*(jnp.asarray(x, float) for x in arguments), call=self)
 
 
@@ -39,7 +40,7 @@ call_p.def_abstract_eval(lambda *_, call: [ShapedArray(shape, jnp.dtype(float)) 
 
 
 def module_call(to: Lowering, equation: Any, inputs: list[Array]) -> list[Array]:
-    """Write the arguments to their places, call the functions, and copy the results."""
+    """Lower a call: store the arguments at their places, call the functions, and return copies of the results."""
     f, call = to.f, equation.params["call"]
 
     def place(name: str, shape: Sequence[int]) -> Stored:
@@ -53,7 +54,7 @@ def module_call(to: Lowering, equation: Any, inputs: list[Array]) -> list[Array]
 
 
 def simplified(closed: Any) -> Any:
-    """Return a jaxpr without repeated calls of a module, without unused results, and without preparations that still hold."""
+    """Return a jaxpr without repeated calls of a module, without unused equations, and without repeated preparations of calls."""
     jaxpr, same, known, equations = closed.jaxpr, {}, {}, []
     for e in jaxpr.eqns:
         e = e.replace(invars=[a if isinstance(a, core.Literal) else same.get(a, a) for a in e.invars])
@@ -74,7 +75,10 @@ def simplified(closed: Any) -> Any:
 
 
 def _prepared_once(equations: Sequence[Any]) -> list[Any]:
-    """Return equations in which no call of a module repeats the preparations of the call before it; none may be dropped later."""
+    """Return equations in which no call of a module repeats the preparations of the call before it.
+
+    No equation may be removed afterwards: a later call may need its preparations.
+    """
     found, prepared = [], None
     for e in equations:
         if e.primitive is call_p and len((call := e.params["call"]).functions) > 1:
@@ -89,6 +93,6 @@ def _prepared_once(equations: Sequence[Any]) -> list[Any]:
 
 
 def _has_calls(equation: Any) -> bool:
-    """Return whether the programs within an equation call functions of a module."""
+    """Return whether the jaxprs within an equation, of loops and branches, call functions of a module."""
     inner = (e for part in parts_of(equation) for e in without_constants(part).eqns)
     return any(e.primitive is call_p or _has_calls(e) for e in inner)

@@ -23,16 +23,16 @@ from udkjax.native.lowering.source_key import source_key
 
 
 class NumberOfRun(NamedTuple):
-    """A leaf that is an array: its numbers are inputs of machine code."""
+    """The shape of an array among the leaves of an object, whose numbers are inputs of machine code."""
 
     shape: tuple[int, ...]
 
 
 @dataclass(frozen=True)
 class OwnObject:
-    """A user-defined object as a tree without its numbers: equal objects have equal machine code.
+    """A user-defined object as a tree without the numbers of its arrays: equal objects have equal machine code.
 
-    Other leaves are stored with their types, as 1, 1.0 and True are equal.
+    Leaves that are not arrays are stored with their types, as 1, 1.0 and True are equal.
     """
 
     structure: Any
@@ -43,7 +43,7 @@ class OwnObject:
         """Return an object without its numbers.
 
         Raises:
-            UnsupportedError: it has arrays of another type than float64.
+            UnsupportedError: the object has arrays of another type than float64.
         """
         leaves, structure = jax.tree.flatten(x)
         for array in numbers_of(x):
@@ -53,23 +53,23 @@ class OwnObject:
 
     @property
     def sizes(self) -> list[int]:
-        """The number of elements of each of its arrays."""
+        """The number of elements of each array of the object."""
         return [int(np.prod(x.shape)) for x in self.leaves if isinstance(x, NumberOfRun)]
 
     @property
     def template(self) -> Any:
-        """The object with the shapes of its arrays in place of the arrays."""
+        """The object with a `NumberOfRun` in place of each array."""
         return jax.tree.unflatten(self.structure, [x if isinstance(x, NumberOfRun) else x[1] for x in self.leaves])
 
     def filled(self, numbers: jax.Array) -> Any:
-        """Return the object with its arrays taken from one vector."""
+        """Return the object whose arrays have the elements of one vector, in the order of `sizes`."""
         parts = iter(np.split(np.arange(sum(self.sizes)), np.cumsum(self.sizes)[:-1]))
         leaves = [numbers[next(parts)].reshape(x.shape) if isinstance(x, NumberOfRun) else x[1] for x in self.leaves]
         return jax.tree.unflatten(self.structure, leaves)
 
 
 def numbers_of(x: Any) -> list[Any]:
-    """Return the arrays of a user-defined object."""
+    """Return the arrays among the leaves of a user-defined object."""
     return [leaf for leaf in jax.tree.leaves(x) if _is_number(leaf)]
 
 
@@ -79,10 +79,10 @@ def _is_number(leaf: Any) -> bool:
 
 @contextmanager
 def named(kind: str, x: Any) -> Iterator[None]:
-    """Name the object in the errors of a block that traces and lowers one of its methods.
+    """Turn errors of the `with` block, which traces and lowers a method of the object x, into errors that name the object.
 
     Raises:
-        UnsupportedError: the message says what has no machine code, or which error its text raised.
+        UnsupportedError: the message names the object, and the operation without machine code or the error of its method.
     """
     name = f"the {kind} {type(x).__name__}"
     try:
@@ -100,7 +100,7 @@ class OwnMethod(Protocol):
     def own(self) -> OwnObject: ...
 
     def evaluate(self, *inputs: Any) -> Any:
-        """Return the results of the method, as JAX traces it."""
+        """Return the results of the method; JAX traces this."""
 
 
 class Input(NamedTuple):
@@ -112,14 +112,14 @@ class Input(NamedTuple):
 
 
 class Written(NamedTuple):
-    """Machine code of a function, and the float64 numbers of scratch memory that it needs in each lane."""
+    """A function as machine code, and the number of float64 numbers of scratch memory that it needs in each lane."""
 
     function: LoweredFunction
     size: int
     unchanged: Sequence[int | None] = ()  # for each result, the index of the input that it is, or None
 
     def calls(self, name: str) -> bool:
-        """Return whether the function calls a function of the module."""
+        """Return whether the function calls, also indirectly, the function `name` of the module."""
         return any(f"@{name}(" in f.text() for f in with_evaluated([self.function]))
 
     def within(self, size: int) -> LoweredFunction:
@@ -135,11 +135,16 @@ class Written(NamedTuple):
 
 @lru_cache(maxsize=64)
 def written(code: OwnMethod, inputs: tuple[Input, ...], width: int, within: Any = None) -> Written:
-    """Return the function `name(inputs..., scratch)` of a user's method, which writes its outputs from the start of `scratch`.
+    """Return the function `name(inputs..., scratch)` of a user's method, which stores its outputs at the start of `scratch`.
 
-    With a module that its text depends on (`within`), whose functions it may call, it is `name(work, inputs..., scratch)`, with
-    places instead of pointers.
-    The text is stored on disk by the object's source, if that is known: tracing and lowering take 30 ms.
+    Its text is stored on disk under a key of the object's source, if there is one: tracing and lowering take 30 ms.
+
+    Args:
+        code: The method.
+        inputs: The inputs of the function, and their shapes.
+        width: The number of lanes.
+        within: Describes the module whose functions the method may call. The function is then `name(work, inputs..., scratch)`,
+            with indices in the memory at `work` instead of pointers. None: it calls none.
     """
     pointers, in_module = [*(x.name for x in inputs), "scratch"], within is not None
     key = source_key(type(code).__name__, code.own.template, within, inputs, width)
@@ -162,7 +167,7 @@ def _traced(code: OwnMethod, shapes: tuple[tuple[int, ...], ...]) -> Any:
 
 
 def _write(f: LoweredFunction, closed: Any, inputs: Sequence[Input]) -> int:
-    """Write the operations of a jaxpr; return the float64 numbers of scratch memory that they need."""
+    """Write the operations of a jaxpr; return the number of float64 numbers that they need in scratch memory in each lane."""
     to = Lowering(f, f.given["scratch"], lower)
     strides = (None if x.stride is None else (x.stride, 1) for x in inputs)
     given = [Stored(f.given[x.name], x.shape, DOUBLE, True, strides=y) for x, y in zip(inputs, strides, strict=True)]

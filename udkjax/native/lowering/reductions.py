@@ -1,4 +1,4 @@
-"""Reductions of arrays, computed at once: sums, products of matrices, extremes."""
+"""Reductions of arrays, whose results are stored in memory: sums, products of matrices, extremes."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -22,7 +22,17 @@ def _reduced(
     start: Any,
     join: Callable[[Value, Value], Value],
 ) -> Array:
-    """Join terms, for each element of a result: for those of a block at once, each in a register."""
+    """Return an array, each element of which joins several terms; the elements of a block are computed together, in registers.
+
+    Args:
+        to: The lowering.
+        x: An array with the base type of the result, which varies if the result does.
+        shape: The shape of the result.
+        terms: The shape of the terms of each element.
+        term: The term of the element at an index (first argument), at an index among the terms.
+        start: The number from which each element begins.
+        join: The operation that joins an element so far and a term.
+    """
     f, lanes = to.f, to.f.width if x.varies else 1
 
     def block(indices: Sequence[Index]) -> list[Value]:
@@ -61,7 +71,7 @@ def _reduced(
 
 
 def reduce_axes(start: Any, join: Any, to: Lowering, inputs: list[Array], p: dict[str, Any], out: Any) -> Array:
-    """Reduce an array along some axes by the operation `join`."""
+    """Reduce an array along some axes by the operation `join`, from the number `start` on (or `start[base]`, by base type)."""
     x, axes = inputs[0], p["axes"]
     kept = [a for a in range(len(x.shape)) if a not in axes]
 
@@ -76,7 +86,7 @@ def reduce_axes(start: Any, join: Any, to: Lowering, inputs: list[Array], p: dic
 
 
 def extreme(name: str, to: Lowering, inputs: list[Array], p: dict[str, Any], out: Any) -> Array:
-    """Return the largest or smallest elements; NaN stays."""
+    """Reduce an array along some axes to its largest elements if `name` is "max", else to its smallest; NaN stays."""
     f, sign = to.f, -1 if name == "max" else 1
 
     def join(a: Value, b: Value) -> Value:
@@ -92,7 +102,7 @@ def extreme(name: str, to: Lowering, inputs: list[Array], p: dict[str, Any], out
 
 
 def cumulative(join: Any, to: Lowering, inputs: list[Array], p: dict[str, Any], out: Any) -> Array:
-    """Join each element of an axis with those before it, or in reverse with those after it."""
+    """Return an array of cumulative sums or products by `join`, from the start or in reverse from the end of an axis."""
     x, f, axis, n = to.stored(inputs[0]), to.f, p["axis"], out.shape[p["axis"]]
     whole = to.new(out.shape, x.base, x.varies)
 
@@ -107,7 +117,7 @@ def cumulative(join: Any, to: Lowering, inputs: list[Array], p: dict[str, Any], 
 
 
 def argument(name: str, to: Lowering, inputs: list[Array], p: dict[str, Any], out: Any) -> Array:
-    """Return the index of the first extreme element; a NaN counts as one."""
+    """Return the index of the first largest (`name` is "max") or smallest element along an axis, or of the first NaN."""
     f, x, (axis,) = to.f, to.stored(inputs[0]), p["axes"]
     lanes, base = f.width if x.varies else 1, INT if x.base == BOOL else x.base
 
@@ -129,7 +139,7 @@ def argument(name: str, to: Lowering, inputs: list[Array], p: dict[str, Any], ou
 
 
 def dot(to: Lowering, inputs: list[Array], p: dict[str, Any], out: Any) -> Array:
-    """Multiply two arrays, and sum over some of their axes."""
+    """Return products of two arrays, summed over some of their axes (`jax.lax.dot_general`)."""
     (over_a, over_b), (batch_a, batch_b) = p["dimension_numbers"]
     f, a, b = to.f, to.stored(inputs[0]), to.stored(inputs[1])
     if a.base != DOUBLE or b.base != DOUBLE:

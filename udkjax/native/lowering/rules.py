@@ -1,4 +1,4 @@
-"""The rules of JAX's primitives: views and elementwise operations are evaluated where they are read, all others at once."""
+"""The rules of JAX's primitives: views and elementwise operations are computed where they are read, all others are stored."""
 
 from collections.abc import Callable
 from functools import partial
@@ -49,10 +49,10 @@ LoweringRule = Callable[[Lowering, list[Array], dict[str, Any], Any], Array]
 
 
 def lower(to: Lowering, equation: Any, inputs: list[Array]) -> list[Array]:
-    """Lower one equation of a jaxpr.
+    """Lower one equation of a jaxpr, whose operands are `inputs`; return its results.
 
     Raises:
-        UnsupportedError: it has no rule; the message names it.
+        UnsupportedError: there is no rule for the equation; the message names its operation.
     """
     name, p = equation.primitive.name, equation.params
     inner = inlined(equation)
@@ -148,7 +148,7 @@ def _plain(function: Callable[..., Any], p: dict[str, Any], to: Lowering, equati
 
 
 def _matrix(equation: Any, **refused: Any):
-    """Raise an error for batches of matrices, and for options that no rule has."""
+    """Raise `UnsupportedError` for batches of matrices, and for options with other values than those given."""
     name, p = equation.primitive.name, equation.params
     if len(equation.invars[0].aval.shape) != 2:
         raise UnsupportedError(f"the operation {name} of batches")

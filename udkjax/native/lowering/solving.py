@@ -1,4 +1,4 @@
-"""Linear systems: factorizations and triangular solutions, in loops over the numbers of memory of their own."""
+"""Linear systems: factorizations and triangular solutions, by loops over numbers in new memory."""
 
 from typing import Any
 
@@ -11,7 +11,7 @@ from udkjax.native.lowering.lowering import Lowering
 
 
 def lu(to: Lowering, equation: Any, inputs: list[Array]) -> list[Array]:
-    """Factorize P A = L U; return both factors in one matrix, the rows of the pivots, and the permutation.
+    """Factorize P A = L U; return both factors in one matrix, the row of the pivot of each step, and the permutation.
 
     The pivot of a column is its largest entry; a column of zeros is left as it is.
     """
@@ -58,7 +58,7 @@ def _exchange(to: Lowering, a: Stored, one: tuple[Operand, ...], other: tuple[Op
 
 
 def cholesky(to: Lowering, equation: Any, inputs: list[Array]) -> list[Array]:
-    """Factorize A = L L^T; L is NaN if A is not positive definite."""
+    """Factorize A = L L^T; return L, which is NaN if A is not positive definite."""
     (a,), f = _matrices(to, equation, inputs), to.f
     n, lanes = a.shape[0], f.width if a.varies else 1
     factor, least = to.new(a.shape, DOUBLE, a.varies), f.variable(np.inf, DOUBLE, lanes)
@@ -80,7 +80,7 @@ def cholesky(to: Lowering, equation: Any, inputs: list[Array]) -> list[Array]:
 
 
 def triangular_solve(to: Lowering, equation: Any, inputs: list[Array]) -> list[Array]:
-    """Solve A X = B or X A = B, with a triangular A or its transpose."""
+    """Return the solution X of A X = B or X A = B, with a triangular A or its transpose."""
     (a, b), f, p = _matrices(to, equation, inputs), to.f, equation.params
     left, is_lower, n = p["left_side"], bool(p["lower"]), a.shape[0]
     swaps = bool(p["transpose_a"]) == bool(left)  # X A = B is A^T X^T = B^T
@@ -105,14 +105,14 @@ def triangular_solve(to: Lowering, equation: Any, inputs: list[Array]) -> list[A
 
 
 def linear_solve(to: Lowering, equation: Any, inputs: list[Array]) -> list[Array]:
-    """Solve by the `solve` function of `lax.custom_linear_solve`; its other functions serve derivatives."""
+    """Lower the function `solve` of a `jax.lax.custom_linear_solve`, whose other functions serve derivatives only."""
     lengths, solve = equation.params["const_lengths"], equation.params["jaxprs"].solve
     first = lengths.matvec + lengths.vecmat
     return to.closed(solve, [*inputs[first : first + lengths.solve], *inputs[sum(lengths) :]])
 
 
 def _matrices(to: Lowering, equation: Any, inputs: list[Array]) -> list[Array]:
-    """Return the matrices of an equation, with known elements."""
+    """Return the operands of an equation, which must be matrices, with their elements computed."""
     if any(len(x.shape) != 2 for x in inputs):
         raise UnsupportedError(f"the operation {equation.primitive.name} of batches")
     return [to.stored(x) for x in inputs]

@@ -1,8 +1,8 @@
-"""Keys of user-defined objects by their source: objects with equal keys have equal text in machine code, in any process.
+"""Keys of user-defined objects by their source: objects with equal keys have equal machine code, in any process.
 
-A key contains the bytecode of all functions that the methods of an object reach, with their constants, closures and global
-values. An object that reaches anything else, whose content is unknown or may change, has no key. Functions of JAX and NumPy count
-by their names and versions, modules of the package by the times of their files.
+A key is a digest of the bytecode of all functions that the methods of an object reach, with their constants, closures and global
+values. An object that reaches anything whose content is unknown or may change has no key. Functions of JAX and NumPy are
+identified by their names and the versions of these libraries, functions of this package by the times of their files.
 """
 
 import builtins
@@ -36,7 +36,7 @@ _PLAIN = (type(None), bool, int, float, complex, str, bytes, type(...))
 
 
 def source_key(*objects: Any) -> str | None:
-    """Return the key of objects and numbers; None if they have none."""
+    """Return one key of several objects and numbers; None if any of them has no key."""
     try:
         found = _Source()
         found.add_all((_versions(), *objects))
@@ -51,10 +51,10 @@ class _UnknownError(Exception):
 
 @cache
 def _versions() -> tuple[Any, ...]:
-    """Return the versions of everything that a key contains by name only.
+    """Return the versions of libraries and files whose functions a key contains by name only.
 
     Raises:
-        _UnknownError: the package has no files.
+        _UnknownError: the files of the package cannot be found.
     """
     files = [file for folder in _FOLDERS for file in sorted((_PACKAGE / folder).rglob("*.py"))]
     files += [_PACKAGE / name for name in _FILES] if files else []
@@ -65,13 +65,13 @@ def _versions() -> tuple[Any, ...]:
 
 
 def _is_known(module: Any) -> bool:
-    """Return True if a key contains objects of a module by name only."""
+    """Return True if keys contain the objects of a module of this name by their names only."""
     parts = str(module).split(".")
     return "random" not in parts and (parts[0] in _KNOWN or str(module).startswith(_PREFIXES))
 
 
 class _Source:
-    """SHA-256 digest of objects; each object is added once."""
+    """The SHA-256 digest of objects. An object that is added again adds the place of its first addition only."""
 
     def __init__(self):
         self.digest, self._places, self._kept = hashlib.sha256(), {}, []
@@ -125,7 +125,7 @@ class _Source:
                 self._add_named(x)
 
     def _add_named(self, x: Any):
-        """Add a module, or a function that is not Python's, by its name or by the function that it compiles."""
+        """Add a module or function of a known library by its name, or a compiled function of JAX by the one that it compiles."""
         module = x.__name__ if isinstance(x, ModuleType) else getattr(x, "__module__", None)
         name = getattr(x, "__name__", None)
         if _is_known(module) and isinstance(name, str) and name not in _CHANGING:

@@ -1,4 +1,4 @@
-"""Updates of arrays at indices that may be unknown: the result has memory of its own."""
+"""Updates of arrays at indices that may be unknown until a run; results are in new memory."""
 
 from typing import Any
 
@@ -9,7 +9,7 @@ from udkjax.native.lowering.views import clamped, index_of
 
 
 def scatter(adds: bool, to: Lowering, inputs: list[Array], p: dict[str, Any], out: Any) -> Array:
-    """Put windows into an array, or add them; a window that is not inside of it is dropped."""
+    """Return an array with windows written into it, or added if `adds`; a window that is not entirely inside is dropped."""
     x, places, change = to.stored(inputs[0]), to.stored(inputs[1]), to.stored(inputs[2])
     d, f = p["dimension_numbers"], to.f
     if d.operand_batching_dims:
@@ -41,7 +41,7 @@ def scatter(adds: bool, to: Lowering, inputs: list[Array], p: dict[str, Any], ou
 
 
 def dynamic_update_slice(to: Lowering, inputs: list[Array], p: dict[str, Any], out: Any) -> Array:
-    """Write a block into an array; start indices are clamped so that the block fits."""
+    """Return an array with a block written into it; start indices are clamped so that the block fits."""
     x, change, *given = inputs
     f, starts = to.f, []
     for s, n, k in zip(given, x.shape, change.shape, strict=True):

@@ -9,12 +9,12 @@ INLINED = frozenset("jit pjit closed_call core_call custom_jvp_call custom_vjp_c
 
 
 def without_constants(jaxpr: Any) -> Any:
-    """Return a jaxpr without its constants."""
+    """Return the jaxpr of a closed jaxpr, or a jaxpr itself."""
     return getattr(jaxpr, "jaxpr", jaxpr)
 
 
 def inlined(equation: Any) -> Any:
-    """Return the program of a call that is lowered in its place; None for other operations."""
+    """Return the jaxpr that an equation calls, if its operations are to be lowered in place of the call; None otherwise."""
     if equation.primitive.name not in INLINED:
         return None
     return next(equation.params[k] for k in ("jaxpr", "call_jaxpr", "fun_jaxpr") if k in equation.params)
@@ -27,7 +27,7 @@ def parts_of(equation: Any) -> list[Any]:
 
 
 def places_of_calls(jaxpr: Any) -> set[str]:
-    """Return the names of the places of all arguments and results of calls of a module's functions."""
+    """Return the names of the places that the calls of a module's functions in a jaxpr use for arguments and results."""
     found: set[str] = set()
     for e in without_constants(jaxpr).eqns:
         if (call := e.params.get("call")) is not None and hasattr(call, "functions"):
@@ -46,7 +46,7 @@ def counts_of_scan(equation: Any) -> tuple[int, int]:
 
 
 def varying(jaxpr: Any, given: Sequence[bool]) -> list[bool]:
-    """Return which outputs vary."""
+    """Return, for each output of a jaxpr, whether it may differ between lanes; `given` tells this of its inputs."""
     jaxpr = without_constants(jaxpr)
     varies: dict[Any, bool] = dict(zip(jaxpr.invars, given, strict=True))
 
@@ -74,7 +74,7 @@ def varying(jaxpr: Any, given: Sequence[bool]) -> list[bool]:
 
 
 def varying_states(body: Any, constants: Sequence[bool], start: Sequence[bool], rows: Sequence[bool] = ()) -> list[bool]:
-    """Return which states of a loop vary: a state that depends on one that does, too."""
+    """Return, for each state of a loop, whether it may differ between lanes, at the start or after any number of passes."""
     states = list(start)
     while True:
         out = varying(body, [*constants, *states, *rows])[: len(states)]
@@ -85,6 +85,6 @@ def varying_states(body: Any, constants: Sequence[bool], start: Sequence[bool], 
 
 
 def states_of_while(test: Any, body: Any, of_test: Sequence[bool], of_body: Sequence[bool], start: Sequence[bool]) -> list[bool]:
-    """Return which states vary: all, if lanes may end at different times."""
+    """Return, for each state of a while loop, whether it may differ between lanes; if the test may, all states may."""
     states = varying_states(body, of_body, start)
     return [True] * len(states) if varying(test, [*of_test, *states])[0] else states

@@ -1,4 +1,4 @@
-"""Views of arrays, and arrays made of parts of others."""
+"""Views of arrays, whose elements are read where they are used, and arrays joined from others in new memory."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -16,14 +16,14 @@ def _view(x: Array, shape: Sequence[int], place: Callable[[Index], Index], f: Fu
 
 
 def broadcast(to: Lowering, inputs: list[Array], p: dict[str, Any], out: Any) -> Array:
-    """Repeat an array along new axes."""
+    """Return an array repeated along new axes, and along axes of length one."""
     x, axes = to.stored(inputs[0]), p["broadcast_dimensions"]
     kept = [None if n == 1 else a for n, a in zip(x.shape, axes, strict=True)]
     return _view(x, out.shape, lambda index: tuple(0 if a is None else index[a] for a in kept), to.f)
 
 
 def transpose(to: Lowering, inputs: list[Array], p: dict[str, Any], out: Any) -> Array:
-    """Exchange axes."""
+    """Return an array with its axes in another order."""
     where = list(p["permutation"])
     return _view(inputs[0], out.shape, lambda index: tuple(index[where.index(a)] for a in range(len(where))), to.f)
 
@@ -42,13 +42,13 @@ def reshape(to: Lowering, inputs: list[Array], p: dict[str, Any], out: Any) -> A
 
 
 def take_slice(to: Lowering, inputs: list[Array], p: dict[str, Any], out: Any) -> Array:
-    """Return a part of an array."""
+    """Return the part of an array between constant indices, with constant steps."""
     starts, steps = p["start_indices"], p["strides"] or (1,) * len(out.shape)
     return _view(inputs[0], out.shape, lambda index: tuple(i * k + s for s, i, k in zip(starts, index, steps, strict=True)), to.f)
 
 
 def reverse(to: Lowering, inputs: list[Array], p: dict[str, Any], out: Any) -> Array:
-    """Reverse axes."""
+    """Return an array reversed along some axes."""
 
     def place(index: Index) -> Index:
         return tuple((out.shape[a] - 1) - i if a in p["dimensions"] else i for a, i in enumerate(index))
@@ -57,7 +57,7 @@ def reverse(to: Lowering, inputs: list[Array], p: dict[str, Any], out: Any) -> A
 
 
 def clamped(f: Function, i: Operand, most: int) -> Operand:
-    """Return an index within 0 and `most`."""
+    """Return the index i, or the nearer one of 0 and `most` if i is outside of this range."""
     if not isinstance(i, Value):
         return min(max(int(i), 0), most)
     if most == 0:
@@ -67,7 +67,7 @@ def clamped(f: Function, i: Operand, most: int) -> Operand:
 
 
 def index_of(f: Function, x: Array) -> Operand:
-    """Return a number as an index: an integer if it is known."""
+    """Return an array of one number as an index: a Python integer if it is known, else a value."""
     return int(x.numbers) if isinstance(x, Constant) else x.read(f, ())
 
 
@@ -83,7 +83,7 @@ def dynamic_slice(to: Lowering, inputs: list[Array], p: dict[str, Any], out: Any
 
 
 def gather(to: Lowering, inputs: list[Array], p: dict[str, Any], out: Any) -> Array:
-    """Return parts of an array at several indices."""
+    """Return the windows of an array that begin at given indices (`jax.lax.gather`)."""
     d, sizes, f = p["dimension_numbers"], p["slice_sizes"], to.f
     x, places = to.stored(inputs[0]), to.stored(inputs[1])
     batch = [k for k in range(len(out.shape)) if k not in d.offset_dims]
@@ -111,7 +111,7 @@ def gather(to: Lowering, inputs: list[Array], p: dict[str, Any], out: Any) -> Ar
 
 
 def concatenate(to: Lowering, inputs: list[Array], p: dict[str, Any], out: Any) -> Array:
-    """Join arrays along an axis."""
+    """Return arrays joined along an axis."""
     f, axis, start = to.f, p["dimension"], 0
     whole = to.new(out.shape, base_of(out.dtype), any(x.varies for x in inputs))
     for x in inputs:
@@ -125,7 +125,7 @@ def concatenate(to: Lowering, inputs: list[Array], p: dict[str, Any], out: Any) 
 
 
 def pad(to: Lowering, inputs: list[Array], p: dict[str, Any], out: Any) -> Array:
-    """Surround the elements of an array, or separate them, by equal numbers."""
+    """Return an array with a number before, after and between its elements along each axis (`jax.lax.pad`)."""
     (x, number), f, config = inputs, to.f, p["padding_config"]
     if any(low < 0 or high < 0 for low, high, _ in config):
         raise UnsupportedError("the operation pad that removes elements")
@@ -141,7 +141,7 @@ def pad(to: Lowering, inputs: list[Array], p: dict[str, Any], out: Any) -> Array
 
 
 def stack(to: Lowering, inputs: list[Array], p: dict[str, Any], out: Any) -> Array:
-    """Join arrays along a new axis."""
+    """Return arrays of equal shape joined along a new axis."""
     f, axis = to.f, p["axis"] % len(out.shape)
     whole = to.new(out.shape, base_of(out.dtype), any(x.varies for x in inputs))
     for k, x in enumerate(inputs):
@@ -154,7 +154,7 @@ def stack(to: Lowering, inputs: list[Array], p: dict[str, Any], out: Any) -> Arr
 
 
 def unstack(to: Lowering, equation: Any, inputs: list[Array]) -> list[Array]:
-    """Return the parts of an array along an axis."""
+    """Return the elements of an array along an axis as separate arrays without this axis."""
     x = to.stored(inputs[0])
     axis = equation.params["axis"] % len(x.shape)
     shape = (*x.shape[:axis], *x.shape[axis + 1 :])
@@ -176,12 +176,12 @@ def split(to: Lowering, equation: Any, inputs: list[Array]) -> list[Array]:
 
 
 def platform_index(to: Lowering, inputs: list[Array], p: dict[str, Any], out: Any) -> Array:
-    """Return which of the variants of a function is for the CPU, or for any platform."""
+    """Return the index of the variant of a function that is for the CPU, or for any platform."""
     return to.constant(np.array(next(k for k, names in enumerate(p["platforms"]) if names is None or "cpu" in names)))
 
 
 def iota(to: Lowering, inputs: list[Array], p: dict[str, Any], out: Any) -> Array:
-    """Return the index along an axis."""
+    """Return an array whose elements are their indices along an axis."""
     f, axis, base = to.f, p["dimension"], base_of(out.dtype)
 
     def read(index: Index) -> Value:

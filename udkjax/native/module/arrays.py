@@ -15,7 +15,7 @@ SPARE = 16  # places of constants are a multiple: the later module of a run (lea
 
 
 class RunArrays(Running):
-    """A module with the arrays of a run, and those of its parts."""
+    """A module with the arrays of a run in its memory, and with the arrays of its parts."""
 
     accelerations, projection, fallback, friction = AccelerationPart(), ProjectionPart(), FallbackPart(), FrictionPart()
     code: RunPrograms
@@ -27,14 +27,14 @@ class RunArrays(Running):
 
     @property
     def shared(self) -> set[str]:
-        """The names of the arrays that parts share and the scene has."""
+        """The groups of arrays that parts of the module share (`Part.shared`), without those that this scene does not need."""
         lacks = {"couplings"} if not self.code.couples else set()
         lacks |= {"rates"} if self.code.position_rows == self.m else set()
         parts = (self.accelerations, self.projection, self.friction, self.fallback)
         return {name for part in parts for name in part.shared} - lacks
 
     def lay_out(self):
-        """Reserve memory for all arrays; layout.py describes them."""
+        """Reserve memory for all arrays of the run, which layout.py describes, and for those that parts share."""
         plan, code, n, m = self.plan, self.code, self.n, self.m
         p = self.places = Layout(plan.width, plan.vector)
         for name in (*LANE_NUMBERS, *plan.own_settings):
@@ -89,7 +89,7 @@ class RunArrays(Running):
 
     @property
     def drop_tol_place(self) -> int | None:
-        """The offset of the threshold of pivots; None if it is not used."""
+        """The offset in the memory of the threshold of pivots, which is one of the constants; None if no program uses it."""
         place = (self.unrolled or self.code).drop_tol_index
         return None if place is None else self.places["constants"] + place
 
@@ -99,7 +99,7 @@ class RunArrays(Running):
 
     @property
     def arrays(self) -> dict[str, PointerPlace]:
-        """The places of the arrays of the scene's programs."""
+        """The places in the memory of the arrays of the scene's programs, by the names that these have in the programs."""
         named = {
             "t": "state t",
             "q": "state q",
@@ -120,12 +120,12 @@ class RunArrays(Running):
         return {x: ("work", self.places[place]) for x, place in named.items()}
 
     def weigh_rows(self):
-        """Reserve memory for weights of rows, which are set for the member in each lane."""
+        """Reserve memory for the weights of the rows of Psi, which `begin_rows` then sets for each member."""
         if "weights" not in self.places.places:
             self.places.add("weights", self.m)
 
     def begin_rows(self, f: Function, lane: Value, length: Value):
-        """Compute the weights of rows of a member from the scales in its lane."""
+        """Set the weights of the rows of a new member in a lane, if weights are needed: `length` over the scale of each row."""
         if "weights" in self.places.places:
             with f.each(self.m) as i:
                 self.put_lane_entry(f, "weights", lane, length / self.lane_entry(f, "rows", lane, i), i)

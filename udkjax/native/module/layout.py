@@ -70,7 +70,7 @@ class Plan:
 
     @property
     def own_settings(self) -> tuple[str, ...]:
-        """The names of the settings of the formulation and the stabilization."""
+        """The names of the further settings that the formulation and the stabilization need."""
         return tuple(name for part in (self.formulation, self.stabilization) if part is not None for name in part.settings)
 
 
@@ -84,7 +84,7 @@ class Layout:
     size: int = 0
 
     def add(self, name: str, count: int = 1) -> int:
-        """Add an array, aligned to a register; return its offset."""
+        """Reserve memory for an array of `count` numbers in each lane, aligned to a register; return its offset."""
         step = max(self.vector // self.width, 1)
         self.places[name] = self.size
         self.size += -(-count // step) * step
@@ -173,7 +173,7 @@ LANE_NUMBERS = {  # numbers of each lane, and their meaning
 
 
 class Lane:
-    """The `LANE_NUMBERS` as attributes: reading loads and assigning stores a number of all lanes; `where` stores in some."""
+    """The `LANE_NUMBERS` as attributes: reading loads and assigning stores a number of all lanes; `where` stores it in some."""
 
     def __init__(self, f: Function, layout: Layout):
         self.__dict__.update(_f=f, _layout=layout)

@@ -1,4 +1,4 @@
-"""Runs that leave their module for a later one, which has functions that few runs need, and is loaded when the first needs them.
+"""Runs that leave their module for a *later* module, whose further functions few runs need; it is loaded when a run needs them.
 
 In the first module, `run(call)` ends where a run has to leave (`stiff`). It then calls `resume(call, members)` of the later
 module with the members in its lanes, and the later module runs these from their beginning, and all members that have not begun.
@@ -25,7 +25,7 @@ GLOBALS = [f"@{name} = global ptr null" for name in POINTERS]
 
 
 def no_members(f: Function) -> Value:
-    """Return the address of an array of the members of the lanes, all empty (-1)."""
+    """Return the address of a new array for the index of the member in each lane, filled with -1: all lanes are empty."""
     members = Value(f, f.reserve(INT, f.width), POINTER)
     with f.each(f.width) as k:
         f.store(-1, members, k, base=INT)
@@ -33,7 +33,7 @@ def no_members(f: Function) -> Value:
 
 
 def go_on_if_loaded(f: Function):
-    """Leave `run(call)` at once for the later module if it is loaded."""
+    """If the later module is loaded, let it run all members, and return from `run(call)`."""
     later = f.op(f"load atomic ptr, ptr @{LATER} acquire, align 8", POINTER)
     with f.if_(~f.is_null(later)):
         f.line(f"call void {later.name}(ptr {f.given['call'].name}, ptr {no_members(f).name})")
@@ -41,7 +41,7 @@ def go_on_if_loaded(f: Function):
 
 
 def go_on(module: Memory, f: Function, members: Value):
-    """Leave `run(call)` for the later module, which is loaded if need be."""
+    """Load the later module, and let it run `members` and all members that have not begun; report no memory if it fails."""
     load = f.op(f"load ptr, ptr @{LOAD}, align 8", POINTER)
     later = f.op(f"call ptr {load.name}()", POINTER)
     f.choose(
@@ -52,7 +52,7 @@ def go_on(module: Memory, f: Function, members: Value):
 
 
 def members_in_lanes(module: Memory, f: Function, s: Lane, present: Value) -> Value:
-    """Return the address of an array of the members of the lanes, empty (-1) for lanes that are not `present`."""
+    """Return the address of a new array with the index of the member in each lane, -1 for lanes that are not `present`."""
     members = no_members(f)
     with module.each_lane(f, present) as k:
         f.store(module.to_int(f, f.lane(s.member, k)), members, k, base=INT)
@@ -60,5 +60,5 @@ def members_in_lanes(module: Memory, f: Function, s: Lane, present: Value) -> Va
 
 
 def write_run(f: Function):
-    """Write `run(call)` of a later module that is called by itself."""
+    """Write the body of the later module's own `run(call)`: it calls `resume` with empty lanes."""
     f.call(RESUME, f.given["call"], no_members(f))

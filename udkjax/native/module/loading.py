@@ -1,4 +1,4 @@
-"""Loaded machine code, registered in XLA as the target of a foreign function."""
+"""Loaded machine code, called from Python or registered in XLA as the target of foreign function calls."""
 
 import ctypes
 import traceback
@@ -15,7 +15,7 @@ from udkjax.native.module import leaving
 
 
 class Later:
-    """The code of the later module of a module that runs may leave (leaving.py)."""
+    """The later module of a module that runs may leave (leaving.py); its `code` is loaded on demand."""
 
     def __init__(self, library: machine.Library, load: Callable[[], "Code"]):
         self._load_code, self._lock = load, RLock()
@@ -23,9 +23,9 @@ class Later:
         self.code: Code | None = None  # None until it is loaded
 
     def load(self) -> int:
-        """Load the code; return the address of its function `resume`, or null if that fails, after printing the error.
+        """Load the code; return the address of its function `resume`, or 0 if that fails, after printing the error.
 
-        Machine code calls this from any thread, also of XLA, and cannot pass an error on: it refuses the call.
+        Machine code calls this from any thread, also of XLA. It cannot pass Python's error on, and reports no memory instead.
         """
         try:
             with self._lock:
@@ -38,9 +38,14 @@ class Later:
 
 
 class Code:
-    """Loaded machine code and its function `run`, which keeps the code loaded.
+    """The loaded machine code of a module; the code stays loaded as long as this object or its function `run` exists.
 
-    `load_later` loads the code of the later module of a module that runs may leave.
+    Args:
+        name: The name for XLA.
+        library: The loaded code.
+        is_interruptible: Whether the code checks for Ctrl-C.
+        load_later: Loads the code of the later module; None if runs do not leave this one.
+        packed_text: LLVM's text of the module, compressed.
     """
 
     def __init__(
@@ -73,15 +78,16 @@ class Code:
 
     @property
     def name(self) -> str:
-        """The name of its FFI target in XLA, for optimized code; it is never freed from then on.
+        """The name of this (optimized) code as an FFI target of XLA.
 
-        XLA keeps one address for each name, and compiled programs may call it at any time.
+        The first access registers the code, which is then never freed: XLA keeps one address for each name, and compiled
+        programs may call it at any time.
         """
         self.register(self._name)
         return self._name
 
     def register(self, name: str) -> None:
-        """Register the code with XLA by a name, unless there is code of this name."""
+        """Register the code with XLA under a name, unless some code is already registered under this name."""
         with _LOADING:
             if name not in _REGISTERED:
                 capsule = jax.ffi.pycapsule(ctypes.c_void_p(self.library["call_frame"]))
@@ -95,9 +101,12 @@ _LOADING = Lock()
 
 
 def load(text: str, level: int = machine.LEVEL, load_later: Callable[[], Code] | None = None) -> Code:
-    """Load the code of a module at a level of optimization, or optimized code if available.
+    """Return the loaded code of a module. All callers with the same text share optimized code while it is loaded.
 
-    `load_later`: loads the code of the later module; None if runs do not leave this one.
+    Args:
+        text: LLVM's text of the module.
+        level: The level of code generation; code of a higher level is returned if it is available.
+        load_later: Loads the code of the later module; None if runs do not leave this one.
     """
     names = (
         "run",
@@ -116,11 +125,11 @@ def load(text: str, level: int = machine.LEVEL, load_later: Callable[[], Code] |
 
 
 def registered(name: str) -> Code | None:
-    """Return the code that XLA knows by a name; None if there is none."""
+    """Return the code that is registered with XLA under a name; None if there is none."""
     return _REGISTERED.get(name)
 
 
 def load_as(name: str, texts: Sequence[str]) -> None:
-    """Load the code of texts (`Code.texts`), and register it with XLA by a name that another process gave it."""
+    """Load the code of the `texts` that `Code.texts` returned in another process, and register it under the name it had there."""
     later = texts[1:]
     load(texts[0], load_later=(lambda: load(later[0])) if later else None).register(name)

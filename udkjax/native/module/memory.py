@@ -11,7 +11,7 @@ from udkjax.native.module.layout import INPUTS, OUTPUTS, SETTINGS, Lane, Layout,
 
 
 class ThreadCode(NamedTuple):
-    """The functions of a thread of a GPU, which runs one member."""
+    """The functions that each thread of a GPU calls to run one member."""
 
     functions: list[Function]  # `run_member` and what it calls
     shared: list[Function]  # further functions, whose arguments point to any memory
@@ -55,19 +55,19 @@ class Memory:
         return "members", "times", "knots", "directions", *inputs, *strides, *self.results, *self.outputs, *lengths, "next"
 
     def text(self) -> str:
-        """LLVM's text of the whole module."""
+        """Write all functions; return LLVM's text of the whole module."""
         raise NotImplementedError
 
     def thread_code(self) -> "ThreadCode":
-        """Write the functions of a thread of a GPU."""
+        """Write the functions that each thread of a GPU calls, and return them."""
         raise NotImplementedError
 
     def function(self, name: str, arguments: Sequence[tuple[str, str]] = ((POINTER, "work"),)) -> tuple[Function, Lane]:
-        """Add a function of all lanes; return it with the numbers of its lanes."""
+        """Add a function of all lanes to the module; return it, and the `Lane` that accesses the numbers of its lanes."""
         raise NotImplementedError
 
     def layout(self, pointer: str) -> Layout:
-        """Return the layout of the memory at a pointer."""
+        """Return the layout of the memory at a pointer: `work`, the memory of a run, or `tangent`, that of a direction."""
         return self.places if pointer == "work" else self.tangents
 
     def start(self, name: str, pointer: str) -> int:
@@ -76,22 +76,22 @@ class Memory:
         return layout[name] * layout.width
 
     def registers(self, pointer: str) -> int:
-        """Return the number of registers of an array of coordinates."""
+        """Return the number of registers that an array of coordinates takes in the memory at a pointer."""
         return -(-self.n * self.layout(pointer).width // self.plan.vector)
 
     def vector(self, f: Function, name: str, r: Value, pointer: str = "work") -> Value:
-        """Return one register of an array of coordinates."""
+        """Return register r of an array of coordinates."""
         return f.load(f.given[pointer], r * self.plan.vector + self.start(name, pointer), self.plan.vector)
 
     def put(self, f: Function, name: str, r: Value, x: Value, pointer: str = "work"):
         f.store(x, f.given[pointer], r * self.plan.vector + self.start(name, pointer), self.plan.vector)
 
     def broadcast(self, f: Function, x: Value) -> Value:
-        """Repeat a number of each lane to match registers of coordinates."""
+        """Return a number of each lane in the width of registers: a single number is repeated for all coordinates."""
         return x if x.width == self.plan.vector else f.repeat(x, self.plan.vector)
 
     def largest(self, f: Function, values: Callable[[Value], Iterable[Value]]) -> Value:
-        """Return the maximum in each lane of `values(r)` over all registers r, ignoring NaN."""
+        """Return the largest of all `values(r)` of all registers r in each lane: at least zero, and NaN is ignored."""
         worst = f.variable(0.0, width=self.plan.vector)
         with f.each(self.rowcount) as r:
             for x in values(r):
@@ -108,7 +108,10 @@ class Memory:
     def weighted_sum(
         self, f: Function, row: np.ndarray, r: Value, names: Sequence[str] | None = None, pointer: str = "work"
     ) -> Value | None:
-        """Return sum_j row_j a_j for one register of coordinates; None if all coefficients are zero."""
+        """Return sum_j row_j a_j for register r of coordinates; None if all coefficients are zero.
+
+        The arrays a_j have the given names; by default they are the accelerations of the stages.
+        """
         total = None
         for weight, name in zip(row, names or self.stage_accelerations, strict=False):
             if weight != 0:
@@ -117,7 +120,7 @@ class Memory:
         return total
 
     def copy(self, f: Function, source: str, to: str, mask: Value | None = None):
-        """Copy an array of coordinates, in all or some lanes, to another array or to the pointer `out`."""
+        """Copy an array of coordinates to the array `to`, or to the pointer `out`, in all lanes or those of `mask`."""
         pointer, start = f.given["out" if to == "out" else "work"], 0 if to == "out" else self.start(to, "work")
         with f.each(self.rowcount) as r:
             place, new = r * self.plan.vector + start, self.vector(f, source, r)
@@ -154,13 +157,13 @@ class Memory:
 
     @contextmanager
     def each_lane(self, f: Function, mask: Value) -> Iterator[Value]:
-        """Run the block for each lane whose mask is true, or one, with the index of the lane."""
+        """Run the code of the `with` block for each lane in which `mask` is true (or 1.0); yield the index of the lane."""
         marks = mask if mask.base == DOUBLE else f.select(mask, f.const(1.0, DOUBLE, f.width), 0.0)
         with f.each(f.width) as k, f.if_(f.lane(marks, k) > 0.5):
             yield k
 
     def copy_lane(self, f: Function, to: Value, start: int, name: str, k: Value, pointer: str = "work", count: int | None = None):
-        """Copy an array of lane k, or its first `count` numbers, to an address; by default all coordinates."""
+        """Copy the first `count` numbers (by default n) of an array in lane k to the address `to`, from the index `start` on."""
         with f.each(self.n if count is None else count) as i:
             f.store(self.lane_entry(f, name, k, i, pointer), to, i + start)
 
@@ -182,7 +185,7 @@ class Memory:
         return f.load(self.member_address(f, name, member), k)
 
     def member_address(self, f: Function, name: str, member: Value) -> Value:
-        """Return the address of a member in an input (one lane)."""
+        """Return the address of the numbers of a member in an input (one lane)."""
         number = member if member.base == INT else self.to_int(f, member)
         return f.at(self.field(f, name, POINTER), number * self.field(f, f"{name} stride"))
 
@@ -191,11 +194,11 @@ class Memory:
         return f.at(self.field(f, name, POINTER), number * length)
 
     def writing_results(self, f: Function) -> AbstractContextManager[None]:
-        """Return a context that writes a block only for calls with the outputs `results`; by default all calls have them."""
+        """Return a context whose code runs only in calls that ask for the outputs `results`, as by default all calls do."""
         return nullcontext()
 
     def write_state(self, f: Function, s: Lane, k: Value, number: Value, q: str, v: str):
-        """Write the state of lane k as state `number` of the outputs."""
+        """Store the arrays `q` and `v` of lane k as output `number`; note the first output that violates Psi too far."""
         row, violated = self.to_int(f, f.lane(s.member, k)) * self.field(f, "times") + number, f.lane(s.violated, k)
         with self.writing_results(f):
             for name, x in (("qs", q), ("vs", v)):
@@ -208,7 +211,7 @@ class Memory:
     def allocate(self, f: Function, count: Value, held: Sequence[Value] = ()) -> tuple[Value, Value]:
         """Allocate `count` numbers; return the block to free and the address of the first number, aligned to a register.
 
-        If there is no memory, the function frees the blocks that it `held`, and returns.
+        If there is no memory, the function `f` reports it, frees the blocks `held` that it has allocated before, and returns.
         """
         size = count * 8 + 64
         block = f.op(f"call ptr @malloc(i64 {size.name})", POINTER)

@@ -16,7 +16,7 @@ from udkjax.native.module.steps import AIM_ACROSS
 
 
 class Module(RunArrays):
-    """The text of one module of machine code: its functions.
+    """One module of machine code: the writer of its functions and of its text.
 
     Args:
         plan: Choices that the code depends on.
@@ -59,7 +59,7 @@ class Module(RunArrays):
             part.reserve()
 
     def choose_parts(self):
-        """Hook: chooses the parts of the module."""
+        """Hook: replace the default parts of the module (parts.py); called before memory is reserved."""
 
     @property
     def solving(self) -> list[str]:
@@ -74,7 +74,7 @@ class Module(RunArrays):
     # --- programs
 
     def program_names(self) -> list[str]:
-        """Return the names of the scene's programs that the module calls."""
+        """Return the names of the scene's programs that the module calls, except those of friction."""
         pieces, rates = ["pieces"] if self.pieces else [], ["drift_of_rates"] if "rates" in self.shared else []
         parts = (self.accelerations, self.projection, self.fallback)
         return ["equation_terms", "psi", *pieces, *(name for part in parts for name in part.programs), *rates]
@@ -106,7 +106,16 @@ class Module(RunArrays):
         width: int | None = None,
         tangent: Layout | None = None,
     ):
-        """Write an unrolled program; `tangent` is the layout at its pointer `tangent`, by default that of the module."""
+        """Write an unrolled program as a function of some pointers.
+
+        Args:
+            program: The program.
+            name: The name of the function.
+            pointers: The names of the function's arguments.
+            at: The places of the program's arrays. Inputs and outputs in other arrays are not used.
+            width: The number of lanes; by default that of the module.
+            tangent: The layout at the pointer `tangent`; by default that of the module.
+        """
 
         def find(places: Sequence[PointerPlace]) -> list[PointerPlace]:
             return [place(x, k) if x in at else (pointers[0], 0) for x, k in places]
@@ -133,7 +142,7 @@ class Module(RunArrays):
         )
 
     def write_prologue(self, name: str, unrolled: Unrolled | None):
-        """Write `name(numbers, constants)` for one member."""
+        """Write `name(numbers, constants)`: compute the constants of one member, by an unrolled program or else by loops."""
         if unrolled:
             inputs, outputs = consecutive("numbers", self.code.number_count), consecutive("constants", self.constants)
             self.functions.append(write(unrolled.prologue, name, 1, ("numbers", "constants"), inputs, outputs))
@@ -146,53 +155,53 @@ class Module(RunArrays):
         return f, Lane(f, self.places)
 
     def new_function(self, name: str, arguments: Sequence[tuple[str, str]], width: int) -> Function:
-        """Add a function of `width` lanes."""
+        """Add a function of `width` lanes to the module; return it."""
         f = Function(name, arguments, width, cold=name in COLD and self.accelerations.has_cold_functions)
         self.functions.append(f)
         return f
 
     def write_derivatives(self):
-        """Hook: writes the functions of derivatives; does nothing by default."""
+        """Hook: write the functions of derivatives; by default there are none."""
 
     def record_stage(self, f: Function, s: Lane, i: int):
-        """Hook: called at the state of stage i of a step, after its accelerations have been computed."""
+        """Hook: write code that runs after the accelerations of stage i of an explicit step, at the state of the stage."""
 
     def record_solved_stage(self, f: Function, s: Lane, i: int):
-        """Hook: called at the state of stage i of an implicit step, after it has been solved in lanes that are `stepping`."""
+        """Hook: write code that runs after stage i of an implicit step has been solved in `stepping` lanes, at its state."""
 
     def record_step(self, f: Function, s: Lane, accept: Value):
-        """Hook: called after a step, when its end has become point 3 in lanes that `accept`."""
+        """Hook: write code that runs after a step, when its end has become point 3 in the lanes of `accept`."""
 
     def record_output(self, f: Function, s: Lane):
-        """Hook: called at an output (`state t`, `state q`, `result v`) of lanes that are `due`."""
+        """Hook: write code that runs at each output (`state t`, `state q`, `result v`), in lanes that are `due`."""
 
     def begin_member(self, f: Function, lane: Value, member: Value):
-        """Hook: called when a member is loaded into a lane; does nothing by default."""
+        """Hook: write code that runs when a member has been loaded into a lane, with its state, settings and constants."""
 
     def begin_numbers(self, f: Function, lane: Value, member: Value):
-        """Hook: called before the constants of a member are computed for the first time."""
+        """Hook: write code that runs before the constants of a new member in a lane are computed for the first time."""
 
     def numbers_in_lane(self, f: Function, lane: Value, numbers: Value) -> Value:
-        """Return the address of the numbers with which the constants of a lane are computed; by default those given."""
+        """Return the address of the numbers from which the constants of a lane are computed; by default `numbers`, as given."""
         return numbers
 
     def enter_start(self, f: Function, lane: Value, member: Value):
-        """Set the constants of a lane again as they were at the start of its member; by default they are so yet."""
+        """Reset the constants of a lane to those at the start of its member; does nothing by default, where they never change."""
 
     def begin_row(self, f: Function, lane: Value, member: Value, numbers: Value, constants: Value):
-        """Hook: called with the addresses of the numbers and constants of a lane when they have changed."""
+        """Hook: write code that runs after the constants of a lane have been computed; arguments are the addresses of both."""
 
     def end_members(self, f: Function, s: Lane):
-        """Hook: called for completed members, in lanes that are `due`."""
+        """Hook: write code that runs when members are complete, in lanes that are `due`, after their results are written."""
 
     def interpolates(self, f: Function, s: Lane) -> Value:
-        """Return whether states between steps may still be asked for, so that the points before the latest are needed."""
+        """Return the lanes that may still evaluate states between steps, for which the points before the latest must be kept."""
         if self.pieces:
             return f.const(True, BOOL, f.width)
         return s.written + 1.0 < self.field(f, "times") - 1
 
     def steps_across_next(self, s: Lane) -> Value:
-        """Return the lanes that have ended a step just before the end of a piece, and go on with a tiny step across it."""
+        """Return the lanes whose step has ended just before the end of a piece, and whose next, tiny step crosses it."""
         return s.aim.is_(float(AIM_ACROSS))
 
     def invoke(self, f: Function, name: str, out: str | None = None):
@@ -200,5 +209,5 @@ class Module(RunArrays):
         self.friction.settle_after(f, name, out)
 
     def accelerate_stage(self, f: Function, i: int):
-        """Compute the accelerations of stage i at `state`."""
+        """Compute the accelerations of stage i of an explicit step, at `state`; derivatives override this."""
         self.accelerations.accelerate(f, f"stage{i} a")

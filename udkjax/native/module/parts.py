@@ -1,7 +1,7 @@
-"""The parts of a module, which the algorithms of a run call. These base classes need no programs or memory.
+"""The parts of a module, which the algorithms of a run call. The base classes here need no programs and no memory.
 
 A part says which programs of the scene it needs, which memory it reserves, and which functions it writes. Modules that run choose
-theirs from parts/.
+theirs from parts/. Most methods write code into a function `f`; those of the base classes write none unless they say otherwise.
 """
 
 from collections.abc import Callable, Collection, Iterator, Sequence
@@ -19,7 +19,7 @@ BeginMember = Callable[[Value, Value], None]  # loads a member into a lane: (lan
 
 
 class Part:
-    """Base of the parts of a module."""
+    """Base class of the parts of a module, with the programs and the memory that a part needs, and the code that it writes."""
 
     shared: Collection[str] = ()
     """Arrays that it shares with other parts: `couplings`, if M is not diagonal; `rows`, Psi_q and M^(-1/2); `rates`, if rows of
@@ -30,31 +30,31 @@ class Part:
     """The arrays of programs in its memory."""
 
     def reserve(self):
-        """Reserve the memory of the part."""
+        """Reserve the memory of the part; by default it needs none."""
 
     def write(self):
-        """Write the functions of the part."""
+        """Write the functions of the part; by default there are none."""
 
 
 class AccelerationPart(Part):
-    """The accelerations of states and the systems of their projection."""
+    """The computation of accelerations, and of the linear systems by which states are projected."""
 
     has_cold_functions = True  # whether the rarely called functions are compiled as such
 
     def accelerate(self, f: Function, to: str):
-        """Compute the accelerations at `state`."""
+        """Compute the accelerations at `state` (time, positions and velocities); store them in the array `to`."""
 
     def accelerate_exactly(self, f: Function, to: str):
-        """Compute accelerations again that programs of derivatives have computed, if they depend on the method."""
+        """Replace the accelerations `to`, which a program of derivatives has computed by elimination, if the method differs."""
 
     def accelerate_and_measure(self, f: Function):
         """Compute the accelerations `result a` at the end of a step that is not projected, with its `psi` and `distance`."""
 
     def accelerate_end(self, f: Function):
-        """Complete `result a` of `state q` and `result v`, the end of a step after its projection."""
+        """Compute `result a` at the projected end of a step (`state q`, `result v`), unless programs of the step have done so."""
 
     def check_pivots(self, f: Function, s: Lane, name: str):
-        """If pivots are too small, compute the accelerations `name` by the fallback, or abandon the attempt."""
+        """In lanes whose pivots are too small for the accelerations `name`, use the fallback or abandon the attempt."""
 
     def highest_rank(self, s: Lane) -> Value | None:
         """Return the largest rank of the rows in the attempted step; None if the method does not find one."""
@@ -65,18 +65,21 @@ class AccelerationPart(Part):
         raise NotImplementedError
 
     def add_numbers(self, f: Function, total: Variable):
-        """Make `total` NaN if the accelerations at `state` are not finite; those by elimination follow from the terms."""
+        """Make `total` NaN if the accelerations at `state` are not finite.
+
+        By default do nothing: accelerations by elimination are finite if the terms are, which the caller has added.
+        """
 
     def accelerate_state(self, f: Function, s: Lane):
-        """Compute `result a`."""
+        """Compute `result a`, the accelerations of a single state outside of a run."""
 
 
 class ProjectionPart(Part):
-    """The projection of states onto the constraints; a module without it has no steps."""
+    """The projection of states onto the constraints, at ends of steps and at outputs. Modules without steps need none."""
 
     @property
     def solving(self) -> list[str]:
-        """The names of the functions that solve linear systems: programs by elimination, or dense equations."""
+        """The names of the functions that solve linear systems; they are programs by elimination or dense equations."""
         return []
 
     @property
@@ -85,13 +88,13 @@ class ProjectionPart(Part):
         return []
 
     def begin_step(self, f: Function, s: Lane):
-        """Prepare a step from point 3."""
+        """Write code that prepares a step from point 3."""
 
     def close_stage(self, f: Function, s: Lane):
-        """Close the state of a stage."""
+        """Change the state of a stage, before its accelerations are computed, so that it satisfies the constraints."""
 
     def end_stage(self, f: Function, i: int):
-        """Change the accelerations of a stage to what is integrated."""
+        """Replace the accelerations of stage i by the rates that are to be integrated."""
 
     def end_step(self, f: Function, s: Lane):
         """Compute `state q`, `result v` and `result a` at the end of a step, and estimate its errors."""
@@ -102,27 +105,27 @@ class ProjectionPart(Part):
     slips = False  # whether positions are integrated at other rates than v
 
     def slipped_between(self, f: Function, s: Lane, r: Value) -> Value:
-        """Return one register of how far positions are from the integral of v at the time `next`."""
+        """Return register r of the positions minus the integral of v, interpolated at the time `next`; needed only if `slips`."""
         raise NotImplementedError
 
     def drift(self, f: Function) -> Value | None:
-        """Return the violation of Psi at the end of an attempted step, relative to the rows' scales; None if it is rounding."""
+        """Return the largest row of Psi over its scale, at the end of an attempted step; None if steps are projected."""
         return None
 
     def judge(self, f: Function, s: Lane, accept: Value, lost: Variable):
-        """Set `lost` to the status of lanes whose new point ends their run."""
+        """Set `lost` to the `Status` with which runs end at their new point, in lanes of `accept`; it stays zero in others."""
 
 
 class FrictionPart(Part):
-    """Friction that depends on the loads of joints; this base class needs no further rounds."""
+    """Friction that depends on the loads of joints; this base class is for scenes without such friction."""
 
     settles = False
 
     def settle_after(self, f: Function, name: str, out: str | None):
-        """Settle the loads after a call of the program `name`."""
+        """After a call of the program `name`, find the loads of joints by further rounds if they are `unsettled`."""
 
     def settle(self, f: Function, out: str):
-        """Settle the loads at `state`, with which programs of derivatives begin; `out` changes."""
+        """Find the loads of joints at `state`, which programs of derivatives need; the array `out` is overwritten."""
 
 
 class FallbackPart(Part):
@@ -131,10 +134,10 @@ class FallbackPart(Part):
     finds_dependent_rows = False  # whether rows that depend on others show by their pivots
 
     def enter(self, f: Function, lane: Value, numbers: Value):
-        """Compute the constants of the fallback in a lane from the numbers of the scene."""
+        """Compute the constants of the fallback in a lane from the numbers of the scene, given by their address."""
 
     def choose_lanes(self, f: Function, s: Lane, due: Value, is_due: Value):
-        """Choose the lanes of the next attempt: if any are `due` for a fallback, only these."""
+        """Set the lanes that are `stepping` in the next attempt: if the fallback `is_due` in any, only those that are `due`."""
         s.stepping = s.active
 
     def check_pivots(self, f: Function, s: Lane, name: str):
@@ -144,51 +147,68 @@ class FallbackPart(Part):
         """Abandon the attempt in lanes whose pivots at the end of a step are too small."""
 
     def finish_step(self, f: Function, s: Lane):
-        """Finish steps by the fallback."""
+        """Complete the end of the steps that the fallback takes."""
 
     def retry(self, f: Function, s: Lane, stepping: Value, failed: Value, tries: Value | None) -> Shortened:
-        """Shorten attempts of `stepping` lanes that encountered too small a pivot, or leave them to the fallback."""
+        """Shorten attempts of `stepping` lanes that encountered too small a pivot, or leave them to the fallback.
+
+        `failed` are lanes without a finite error, `tries` those whose attempt was a trial of an implicit step. By default all
+        attempts are complete.
+        """
         s.fallback_due = f.const(0.0, DOUBLE, f.width)
         return stepping, f.const(False, BOOL, f.width), f.const(np.inf, DOUBLE, f.width)
 
     def limit_of_error(self, f: Function, s: Lane, time_left: Value) -> Value | float:
-        """Return the error, relative to the tolerance, up to which a step is accepted."""
+        """Return the error, relative to the tolerance, up to which a step is accepted.
+
+        `time_left` is the time (s) from the start of this step to a singular configuration.
+        """
         return 1.0
 
     def step_around(
         self, f: Function, s: Lane, accept: Value, lanes: Callable[[], Value], time_left: Value, step: Value, otherwise: Value
     ) -> Value:
-        """Return the next step, after one that is accepted or repeated: in `lanes` one around a singular configuration."""
+        """Return the length of the next step: in some lanes it is planned so that no node is close to a singular configuration.
+
+        Args:
+            f: The function.
+            s: Its lanes.
+            accept: The lanes whose step was accepted; others repeat it.
+            lanes: Returns the lanes in which steps may be planned.
+            time_left: The time (s) from the start of the attempted step to the singular configuration.
+            step: The length (s) of the attempted step.
+            otherwise: The length (s) of the next step without a plan.
+        """
         return otherwise
 
     def close_output(self, f: Function, s: Lane, mask: Value):
-        """Close outputs that still violate Psi."""
+        """Project outputs, in the lanes of `mask`, that still violate Psi, on all rows."""
 
     def keeping_rows(self, f: Function, do: Callable[[], None]):
-        """Run `do`, which projects an output, with rows that a step would leave out."""
+        """Run the code of `do()`, which projects an output, with rows that a step would leave out because of small pivots."""
         do()
 
     def with_loads(self, f: Function, do: Callable[[], None], lanes: Value | None = None):
-        """Run `do` with the loads that friction has in steps of the fallback; `lanes`: where only some pivots are unsafe."""
+        """Run the code of `do()` with the loads that friction has in steps of the fallback, in `lanes` or in all."""
         do()
 
     def evaluate_settled(self, f: Function, s: Lane, settle: Callable[[], None], evaluate: Callable[[], None]):
-        """Run `evaluate`; in steps of the fallback, with loads that `settle` finds anew."""
+        """Run the code of `evaluate()`; if pivots are unsafe, with loads of the fallback, which the code of `settle()` finds."""
         evaluate()
 
     def with_lost_loads(self, s: Lane, accept: Value, lost: Value) -> Value:
-        """Return the lanes that are `lost`, or whose accepted step left out unbounded loads of joints."""
+        """Return the lanes of `lost`, and those whose accepted step left out loads of joints that may grow without bounds."""
         return lost
 
     def if_safe(self, s: Lane, mask: Value) -> Value:
-        """Return the lanes of a mask whose latest pivots are safe."""
+        """Return the lanes of a mask whose latest pivots are safe; by default the whole mask."""
         return mask
 
     def accelerate_state(self, f: Function, s: Lane):
         """Compute `result a` again in lanes whose pivots are too small."""
 
     def find_tangent_part(self, f: Function, s: Lane):
-        """Compute the tangent parts `result dq` and `result dv` again near singular configurations."""
+        """Compute `result dq` and `result dv`, the tangent parts of changes, again in lanes near singular configurations."""
 
 
 class StiffnessPart(Part):
@@ -205,105 +225,116 @@ class StiffnessPart(Part):
         self._plan = plan
 
     def exact(self, f: Function) -> Any:
-        """Return the matrix at a solved stage, for derivatives."""
+        """Return the matrix D (`DenseMatrices`) of the stage equations at a solved stage, which derivatives need."""
         raise NotImplementedError
 
     def write_measurement(self):
-        """Write the measurement of the rate of the equations."""
+        """Write the function that measures the largest rate of the equations (run/stiffness.py)."""
 
     def write_stages(self, start: str):
-        """Write the stages of an implicit step from a point."""
+        """Write the function that computes the stages of an implicit step from the point `start`, for example "point3"."""
 
     # --- a step
 
     def methods(self, f: Function, s: Lane) -> Iterator[tuple[Method, Value | None]]:
-        """Run the block for each method of the module, with the mask of the lanes whose attempt it makes; None: all lanes."""
+        """Yield each method of the module, and the mask of the lanes whose attempt it makes (None: all lanes)."""
         yield self._plan.method, None
 
     def take_stages(self, f: Function, s: Lane, implicit: Value, explicit: Callable[[], None]):
-        """Take the stages of a step: by `explicit`, or in lanes with an `implicit` attempt by the implicit method."""
+        """Take the stages of a step: by the code of `explicit()` or, in the lanes of `implicit`, by the implicit method."""
         explicit()
 
     def smooth_error(self, f: Function, s: Lane):
-        """Damp fast motions in the errors of trials of implicit steps."""
+        """Damp the part of fast motions in the estimated errors of implicit steps that are trials."""
 
     def end_step(self, f: Function, s: Lane, implicit: Value):
-        """Set `result a` at the end of implicit steps."""
+        """Set `result a` at the end of a step in the lanes of `implicit`."""
 
     def repeat_diverged(self, f: Function, s: Lane, implicit: Value):
-        """Set the `error` of implicit steps that have to be repeated."""
+        """Set the `error` of implicit steps that have to be repeated, as a stage did not converge: a shorter step follows."""
 
     # --- the decision on the next step
 
     def trials(self, s: Lane, stepping: Value) -> Value | None:
-        """Return the lanes whose attempt is a trial of an implicit step."""
+        """Return the `stepping` lanes whose attempt is a trial of an implicit step; None if the module makes no trials."""
         return None
 
     def cost(self, f: Function, s: Lane, implicit: Value, explicit: Value) -> Value:
-        """Return the evaluations of an attempt."""
+        """Return the number of evaluations that an attempt counts for; `explicit` is that of an explicit step."""
         return explicit
 
     def shift_points(self, f: Function, s: Lane, accept: Value):
-        """Store whether the steps to the accepted states were implicit."""
+        """Move the marks of points whose steps were implicit, in lanes whose step is accepted and becomes the latest."""
 
     def choose_next(self, f: Function, s: Lane, stepping: Value, accept: Value, implicit: Value, tries: Value | None):
-        """Choose the method of the next step; `tries`: lanes whose attempt was a trial."""
+        """Choose the method of the next step after an attempt.
+
+        The arguments are masks: of lanes that made an attempt, whose step was accepted, was implicit, and was a trial (None:
+        there are no trials).
+        """
 
     # --- the end of the next step
 
     def plan_length(self, f: Function, s: Lane, begin: Value, start: Value, stop: Value) -> Value:
-        """Return the length of the next step from the time `start`, before it is shortened to end by `stop`."""
+        """Return the length (s) of the next step from the time `start`, which is later shortened if it would end after `stop`."""
         return s.h
 
     def splits(self, s: Lane, splits: Value) -> Value:
-        """Return the lanes of a mask whose steps have to be as short as interpolation needs them."""
+        """Return the lanes of a mask whose steps after a breakpoint have to be short, as outputs need several points."""
         return splits
 
     def ends_at_output(self, f: Function, s: Lane, begin: Value, start: Value, t1: Value, stop: Value) -> Value | None:
-        """Return the lanes whose step from the time `start` ends at an output, instead of `t1`."""
+        """Return the lanes whose step from the time `start` must end at an output instead of at `t1`; None if there are none."""
         return None
 
     def next_begin(self, f: Function, s: Lane) -> Value:
-        """Return `begin` of steps that do not begin a run."""
+        """Return the number `begin` of next steps that do not begin a run: -1 for implicit ones, else zero."""
         return -s.stiff
 
     # --- points
 
     def between_explicit(self, s: Lane, near: Value, k: int) -> Value:
-        """Return the lanes of a mask in which the steps to point k and to that before were explicit."""
+        """Return the lanes of the mask `near` in which the steps to the points k and k - 1 were explicit."""
         return near
 
     def return_to_point(self, s: Lane, mask: Value, k: int):
-        """Restore the state of point k in the masked lanes, before the run continues from there."""
+        """Restore the mark of point k, if its step was implicit, in masked lanes whose runs continue from there."""
 
     def begin_anew(self, f: Function, s: Lane) -> Value:
-        """Return the `begin` with which steps start anew after an event."""
+        """Return the number `begin` with which steps continue after an event: -1 for implicit ones, else zero."""
         return f.const(0.0, DOUBLE, f.width)
 
     # --- the run of all members (leaving.py)
 
     def begin_run(self, f: Function):
-        """Begin `run(call)`."""
+        """Write code for the beginning of `run(call)`."""
 
     def begin_members(self, f: Function, take: Callable[[], Value], begin: BeginMember, fill: Callable[[], None]):
-        """Load the first members into the lanes."""
+        """Load the first members into the lanes.
+
+        Args:
+            f: The function that runs members.
+            take: Returns the index of the next member that has not begun.
+            begin: Loads a member into a lane.
+            fill: Loads the next members into all empty lanes.
+        """
         fill()
 
     def stays(self, f: Function, s: Lane, goes_on: Value, present: Callable[[], Value]) -> Value:
-        """Return whether the run goes on in this module."""
+        """Return whether to take another step in this module: `goes_on`, unless one of the `present()` lanes has to leave."""
         return goes_on
 
     def end_run(self, f: Function, s: Lane, free: Callable[[], None]):
-        """End `run(call)`."""
+        """End `run(call)`; `free()` writes code that frees its memory."""
         free()
 
     def write_entries(self) -> list[Function]:
-        """Return further functions that run members."""
+        """Return further functions by which others call the module."""
         return []
 
     def if_leaving(self, do: Callable[[], None]):
-        """Run `do` if members may leave the module."""
+        """Call `do()`, which writes code, if members may leave the module; otherwise do nothing."""
 
     def mark(self, text: str) -> str:
-        """Return the text of the module, with the names of functions that are compiled apart."""
+        """Return the text of the module, with a comment that names functions to compile apart if there are any (text.py)."""
         return text

@@ -29,13 +29,20 @@ GIVEN = ("d", "e")  # directions of numbers and of initial states, whose second 
 
 
 class ProgramDerivative:
-    """One of the differentiable programs of a scene and its derivative in a module."""
+    """The writer of one of the scene's differentiable programs, and of its derivative, as functions of a module."""
 
     stored: int
     """The number of intermediate results that its derivatives need."""
 
     def __init__(self, module: Module, name: str, evaluation: str = "evaluation", slopes: Layout | None = None):
-        """`slopes`: the tangent of the slopes of the accelerations."""
+        """Prepare the program, and reserve the memory that its derivative needs.
+
+        Args:
+            module: The module.
+            name: The program, of `DIFFERENTIATED`.
+            evaluation: The name of the function that evaluates it, without its suffix.
+            slopes: The layout of the tangent, for the derivatives by the state alone; None: the mode and layout of the module.
+        """
         self._module, self._name = module, name if slopes is None else SLOPES
         self._suffix = "" if self._name == "accelerations" else f"_{self._name}"
         self._evaluation = evaluation + self._suffix
@@ -59,7 +66,7 @@ class ProgramDerivative:
             module.places.add("along", len(PREFIXES[module.mode]) * sum(module.code.stored_sizes.values()))
 
     def place(self, name: str) -> int:
-        """Return the offset of an array in the results that loops store."""
+        """Return the offset of an array of intermediate results at the pointer `stored`, for programs as loops."""
         return self._stored[name]
 
     @property
@@ -86,7 +93,7 @@ class ProgramDerivative:
             self._module.loops.write(self._evaluated.program, name, pointers, at)
 
     def forward(self):
-        """Write `forward`, or `twice`."""
+        """Write the function `forward` or `twice`, after the mode of the module; for slopes, always `forward`."""
         w = self._tangent or self._module.tangents
         changes = {"constants": "constants", "q": "state q", "v": "state v", "q1": "result q", "v1": "result v"}
         prefixes, program = PREFIXES[self._mode], self._evaluated.in_mode(self._mode, self._fixed)

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 
 class CalledProgram(NamedTuple):
-    """The outputs of a program, and the arrays of the module that store outputs under another name."""
+    """The outputs of a program; and, by output, the arrays of the module that store outputs under another name."""
 
     outputs: tuple[str, ...]
     stored: Mapping[str, str] = {}

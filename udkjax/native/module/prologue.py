@@ -17,7 +17,7 @@ PROLOGUE = {mode: f"prologue_{mode}" for mode in (FORWARD, REVERSE, TWICE)}
 
 
 def write_prologue_derivative(module: Module, active: Sequence[bool], mode: str):
-    """Write the derivative with respect to the active numbers in a mode of differentiation."""
+    """Write the function `PROLOGUE[mode]`, the derivative of the prologue with respect to the active numbers."""
     changes = ("constants", "numbers") if mode == REVERSE else ("numbers", "constants")
     pointers = ("numbers", "constants", *(prefix + x for x in changes for prefix in PREFIXES[mode]))
     at = {x: (x, 0) for x in pointers}

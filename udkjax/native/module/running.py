@@ -17,8 +17,8 @@ Repeat = Callable[[Callable[[], Value], Callable[[], None]], None]  # repeats a 
 class Running(Memory):
     """A module that runs members in lanes.
 
-    Lanes load members by the function `begin(work, call, lane, member)`, and `step_all` takes them a step further and finishes
-    them.
+    The function `begin(work, call, lane, member)` loads a member into a lane; the code of `step_all` takes the members in all
+    lanes a step further, and finishes those that are complete.
     """
 
     ways: tuple[str, ...] = ()  # prefixes of the inputs of each tangent of a group, in forward mode
@@ -33,7 +33,7 @@ class Running(Memory):
     """True if Ctrl-C ends runs: on a page, which has no signals, it cannot."""
 
     def text(self) -> str:
-        """LLVM's text of the whole module."""
+        """Write all functions; return LLVM's text of the whole module."""
         self.write_functions()
         self._write_run()
         pointers = [*self.stiffness.pointers, *([interrupts.GLOBAL] if self._has_signals else [])]
@@ -48,33 +48,33 @@ class Running(Memory):
 
     @abstractmethod
     def write_functions(self):
-        """Write all functions but `run`."""
+        """Write all functions except `run` and `run_member`."""
 
     def present(self, f: Function, s: Lane) -> Value:
-        """Return which lanes have a member."""
+        """Return the mask of the lanes that have a member."""
         return s.active > 0.5
 
     @abstractmethod
     def step_all(self, f: Function, s: Lane, fill: Callable[[], None]):
-        """Take one step in all lanes, and finish completed members."""
+        """Take one step in all lanes, and finish completed members; the code of `fill()` loads the next ones into empty lanes."""
 
     def member_of(self, f: Function, thread: Value) -> Value:
-        """Return the index of the member of a thread of a GPU."""
+        """Return the index of the member that a thread of a GPU runs, from the number of the thread."""
         return thread
 
     def write_member(self, f: Function, s: Lane, repeat: Repeat):
-        """Take the member of a thread of a GPU through all its steps."""
+        """Take the member of a thread of a GPU through all its steps, by loops that `repeat(goes_on, step)` writes."""
         repeat(lambda: f.any_of(self.present(f, s)), lambda: self.step_all(f, s, lambda: None))
 
     def take_next(self, f: Function, s: Lane, fill: Callable[[], None]):
-        """Fill the lanes of completed members with the next members."""
+        """Load the next members into the lanes of completed ones, by the code of `fill()`."""
         fill()
 
     def release(self, f: Function, s: Lane):
-        """Hook: frees the memory of the members in lanes when they leave the module."""
+        """Hook: write code that frees memory of the members in lanes when they leave the module."""
 
     def begin_memory(self, f: Function):
-        """Store the numbers that all members share, once per run, in zeroed memory."""
+        """Store the numbers that all members share, once per call, in memory that has been cleared."""
         for begin in self.begins:
             begin(f)
 
@@ -84,11 +84,11 @@ class Running(Memory):
 
     @property
     def _memory_size(self) -> int:
-        """The count of numbers in the memory of a run."""
+        """The number of float64 numbers in the memory of a run."""
         return self.places.size * self.plan.width + 2 * self.plan.vector
 
     def _clear_memory(self, f: Function):
-        """Clear the memory at `work`, and store what all members share, and numbers with which lanes that stay empty compute."""
+        """Clear the memory at `work`; store the numbers that all members share, and harmless ones for lanes that stay empty."""
         work, width = f.given["work"], self.plan.width
         s = Lane(f, self.places)
         start, end = (place * width for place in self.unused)
@@ -104,7 +104,7 @@ class Running(Memory):
                 self.put_entry(f, name, i, 1.0)
 
     def _write_run(self):
-        """Write `run(call)`: run all members; or `resume(call, members)` (leaving.py), and `run`, which calls it."""
+        """Write `run(call)`: run all members. In a later module, write `resume(call, members)` and a `run` that calls it."""
         width, (name, arguments) = self.plan.width, self.stiffness.entry
         f = Function(name, [(POINTER, x) for x in arguments], width)
         self.functions.append(f)
@@ -170,7 +170,7 @@ class Running(Memory):
     # --- memory of directions
 
     def groups(self, f: Function) -> Value:
-        """Return the number of groups of directions."""
+        """Return the number of groups into which the directions of the call are divided."""
         return f.arithmetic("div", self.field(f, "directions") + (self.group - 1), self.group)
 
     def first_tangent(self, f: Function) -> Value:

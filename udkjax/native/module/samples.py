@@ -11,7 +11,7 @@ ARGUMENTS = ((POINTER, "work"), (POINTER, "call"), (INT, "lane"))
 
 
 def count_breakpoints(module: Module, f: Function, member: Value, time: Value) -> Value:
-    """Count the breakpoints of a member before a time, by bisection."""
+    """Return the number of breakpoints of a member before a time, found by bisection."""
     breaks = module.member_address(f, "breaks", member)
     low, high = f.variable(0, INT, 1), f.variable(module.field(f, "knots"), INT, 1)
     with f.while_(lambda: low.value < high.value):
@@ -22,14 +22,14 @@ def count_breakpoints(module: Module, f: Function, member: Value, time: Value) -
 
 
 def enter_first_row(module: Module, f: Function, lane: Value, member: Value):
-    """Set the constants of a lane for the start of its member."""
+    """Set the constants of a lane to those at the start of its member."""
     start, smallest = (module.lane_entry(f, name, lane) for name in ("start", "smallest"))
     module.put_lane_entry(f, "knot", lane, count_breakpoints(module, f, member, start - smallest))
     f.call("enter", f.given["work"], f.given["call"], lane)
 
 
 def write_next_breakpoint(module: Module):
-    """Write `next_breakpoint(work, call)`: `due` becomes the first breakpoint that a lane has not passed, or infinity."""
+    """Write `next_breakpoint(work, call)`: set `due` to the first breakpoint (s) that a lane has not passed, or to infinity."""
     f, s = module.function("next_breakpoint", ARGUMENTS[:2])
     knots = module.field(f, "knots")
     with f.each(f.width) as k:
@@ -58,7 +58,7 @@ def write_enter(module: Module):
 
 
 def numbers_of_row(module: Module, f: Function, member: Value, row: Value) -> Value:
-    """Return the address of a copy of a member's numbers with a row of samples inserted."""
+    """Return the address of a copy of a member's numbers, in which sampled numbers have the values of a row of samples."""
     given = module.member_address(f, "numbers", member)
     copy = module.address(f, "numbers")
     with f.each(module.code.number_count) as i:

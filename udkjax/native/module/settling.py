@@ -1,10 +1,10 @@
 """Further rounds of Newton's method for friction that depends on the loads of joints.
 
-The programs `SETTLING` take one round. They set `unsettled`, unless it suffices, to the sum of one if the loads are no solution
-and of two if pivots are negative. The solution of their linear system is `settled`. Two functions then take as many more rounds
-as such lanes need, and leave other lanes as they are. Lanes that still do not settle, or whose pivots are negative, begin again
-with the solution without friction, and follow it as friction grows: at once, in `RunPrograms.STAGES`, or in shorter stages where
-one of these fails. A solution with negative pivots counts at the end of such a stage:
+The programs `SETTLING` take one round. They set `unsettled` to zero if that suffices, otherwise to the sum of one if the loads
+are no solution and of two if pivots are negative. The solution of their linear system is `settled`. Two functions then take the
+further rounds that unsettled lanes need; other lanes do not change. Lanes that still do not settle, or whose pivots are negative,
+begin again with the solution without friction, and follow it as friction grows: to all of it at once, in `RunPrograms.STAGES`
+stages, or in shorter stages where one of these fails. At the end of such a stage, a solution with negative pivots is accepted:
 
     settle_state(work, out)    at `state v`; the accelerations are at `out`
     settle_end(work, out)      the same at `result v`, the velocities at the end of a step
@@ -34,7 +34,7 @@ class LoadFriction(FrictionPart):
     arrays = RunPrograms.BEGINS
 
     def __init__(self, module: Memory, at_end: bool):
-        """`at_end`: whether the module has programs of the end of a step."""
+        """Prepare the rounds of a module; `at_end` tells whether it has programs of the end of a step, which need them, too."""
         self._in, self._at_end = module, at_end
 
     def reserve(self):
@@ -62,13 +62,13 @@ class LoadFriction(FrictionPart):
 
 
 def friction_of(module: Memory, names: Sequence[str]) -> FrictionPart:
-    """Return the friction of a module with programs of these names."""
+    """Return the part of a module for friction by loads; `names` are the programs of the module."""
     needs = module.plan.code.rubs and any(name in SETTLING for name in names)
     return LoadFriction(module, any(name in AT_END for name in names)) if needs else FrictionPart()
 
 
 def write_settle_state(module: Memory, f: Function, s: Lane):
-    """Write `settle_state`: find the loads of joints at `state`, by rounds of Newton's method, else by shares of friction."""
+    """Write `settle_state`: find the loads of joints at `state` by Newton's method or, if that fails, by stages of friction."""
     s.friction_share = f.const(1.0, DOUBLE, f.width)
     _write_rounds(module, f, s, SETTLING_ROUNDS, _may_settle)
     with f.if_(f.any_of(s.unsettled > 0.5)):
@@ -84,7 +84,7 @@ def _fails(unsettled: Value) -> Value:
 
 
 def _write_stages(module: Memory, f: Function, s: Lane):
-    """Follow the solution of unsettled lanes from that without friction on."""
+    """Write the stages of unsettled lanes: follow the solution from that without friction to that with all of it."""
     zero, one = (f.const(x, DOUBLE, f.width) for x in (0.0, 1.0))
     most, least = 1 / RunPrograms.STAGES, 1 / RunPrograms.STAGES**2
     s.staged, s.stage, s.reached = f.select(s.unsettled > 0.5, one, zero), one, f.const(-1.0, DOUBLE, f.width)
@@ -110,7 +110,7 @@ def _keep(module: Memory, f: Function, source: str, to: str, mask: Value):
 
 
 def _write_rounds(module: Memory, f: Function, s: Lane, most: int, goes_on: Callable[[Value], Value]):
-    """Take rounds in the lanes whose `unsettled` asks for them; those that fail have NaN at `out` after the last one."""
+    """Take at most `most` rounds, in lanes as long as `goes_on(unsettled)`; accelerations at `out` are NaN where they fail."""
     k = f.variable(0, INT, 1)
     with f.while_(lambda: f.any_of(goes_on(s.unsettled)) & (k.value < most)):
         before = s.unsettled

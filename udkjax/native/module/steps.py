@@ -104,7 +104,8 @@ class Status:
 
     `NOT_FINITE`: the step became too small because of a non-finite number. `LOST`: the run left the constraint manifold.
     `SINGULAR`: a run that is not projected is too far from the manifold for the singular configuration that it is near.
-    `SPURIOUS_RANK`: more rows counted as independent than are. `MISSING_RANK`: fewer, and the motion violates those left out.
+    `SPURIOUS_RANK`: dependent rows were treated as independent. `MISSING_RANK`: independent rows were left out as dependent, and
+    the motion violates them.
     Runs that watch conditions also end as `CROSSED`, at a zero crossing, or `UNRESOLVED`, where a crossing is possible.
     `INTERRUPTED`: by Ctrl-C.
     """

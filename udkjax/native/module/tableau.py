@@ -45,8 +45,9 @@ class Method:
     ) -> "Method":
         """Return the method with nodes c, rows of A after the first, weights b, weights of the error estimate, and an order.
 
-        The rows of A have no entries on the diagonal; those of an implicit method are all `diagonal`. `predictor` has as many
-        rows: the accelerations of each stage, extrapolated from those of the stages before.
+        The rows in `stages` are without entries on the diagonal of A, which are all `diagonal` for an implicit method, else zero.
+        `predictor` has the same number of rows: weights that extrapolate the accelerations of a stage from those of the stages
+        before. If there is a method with equal numbers, it is returned.
         """
         A, P = np.zeros((len(c), len(c))), np.zeros((len(c) if diagonal else 0, len(c)))
         for rows, given in ((A, stages), (P, predictor)):
@@ -63,19 +64,22 @@ class Method:
 
     @property
     def is_implicit(self) -> bool:
-        """True if stages are the solutions of equations."""
+        """True if the accelerations of stages are solutions of equations."""
         return self.diagonal != 0
 
     @property
     def clearings(self) -> tuple[float, float]:
-        """Fractions of a step far from all nodes: the middles of the widest gap between nodes, and of the widest gap before."""
+        """Two fractions of a step that are far from all nodes, the smaller one first.
+
+        The second is the middle of the widest gap between nodes, the first that of the widest gap before it.
+        """
         middles, gaps = self._gaps
         widest = np.argmax(gaps)
         return middles[np.argmax(gaps[: max(widest, 1)])], middles[widest]
 
     @property
     def clearance(self) -> float:
-        """The distance between the middle of the widest gap and its ends, as a fraction of a step."""
+        """Half of the length of the widest gap between nodes, as a fraction of a step."""
         return float(np.max(self._gaps[1])) / 2
 
     @property

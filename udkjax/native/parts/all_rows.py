@@ -1,7 +1,7 @@
-"""The methods of the fallback, on all rows.
+"""The methods of the fallback, which use all rows of Psi.
 
 For small scenes the method is the pseudoinverse by singular values, lane by lane. For large scenes it is elimination of all rows
-with dependent rows left out, which near singular configurations has about half as many correct digits.
+with dependent rows left out, which has about half as many correct digits near singular configurations.
 """
 
 import numpy as np
@@ -20,14 +20,17 @@ from udkjax.native.pseudoinverses.weighted_rows import WeightedRows
 
 
 def fallback_of(module: Module) -> FallbackPart:
-    """Return the fallback of a module: for small scenes, and if redundant rows share loads, singular values."""
+    """Return the fallback of a module, by singular values for small scenes or if redundant rows share loads, else by elimination.
+
+    It is a `FallbackPart`, which takes no steps, if the accelerations do not report small pivots.
+    """
     if not (module.code.policy.reports and module.m):
         return FallbackPart()
     return (BySingularValues if module.plan.unrolled or module.code.weighs_rows else ByElimination)(module)
 
 
 class ByElimination(RankRevealing):
-    """Elimination of all rows, with a copy of the constants for another threshold."""
+    """The fallback by elimination of all rows; it has its own copy of the constants, with another threshold of pivots."""
 
     def reserve(self):
         super().reserve()
@@ -60,7 +63,7 @@ class ByElimination(RankRevealing):
 
 
 class BySingularValues(RankRevealing):
-    """The pseudoinverse by singular values, lane by lane."""
+    """The fallback by the pseudoinverse from singular values, lane by lane."""
 
     programs = ("rows_and_loads",)
     arrays = ("psi_q", "psi_dot", "root")
@@ -80,7 +83,11 @@ class BySingularValues(RankRevealing):
 
     @property
     def _solutions(self) -> dict[str, tuple[str, float, str, int]]:
-        """For each result: the array it is added to, its sign, and the right-hand side with the place of its first number."""
+        """The linear systems, by the name of the result.
+
+        Each has the array to which the solution is added, the sign of the solution, and the array of the right-hand side with the
+        index of its first number there.
+        """
         n = self._in.n
         return {"a": ("terms", 1.0, "terms", n), "v": ("state v", -1.0, "psi_dot", 0), "q": ("state q", -1.0, "psi", 0)}
 
@@ -120,11 +127,11 @@ class BySingularValues(RankRevealing):
             rows.put(f, "change" if couples else "fallback dv", i, new)
 
     def _hold_left_out(self, f: Function, rows: WeightedRows):
-        """Take the loads from the accelerations along left out rows, of a mechanism that moves, in the row `x`.
+        """Remove the components of the loads along rows that are left out from the solution `x`, if the mechanism moves.
 
-        It passes the singular configuration within so short a time that its velocity changes little. But no row opposes loads
-        along those that are left out: loads as large as that of a stiff damper would turn it, and the motion change its branch.
-        Directions of rows that are dependent everywhere are rounding errors.
+        A moving mechanism passes the singular configuration within so short a time that its velocity should change little. But
+        no row opposes loads along the rows that are left out: a load as large as that of a stiff damper would turn the velocity,
+        and the motion would change its branch. Components along rows that are dependent everywhere are rounding errors, and stay.
         """
         d, squares, name = rows.matrices(f), rows.matrices(f).row("lengths"), "fallback a" if self._in.code.couples else "terms"
 
@@ -147,11 +154,11 @@ class BySingularValues(RankRevealing):
                 d.axpy(-along(row) / square, row, d.row("x"))
 
     def _write_functions(self):
-        """Write the functions of all lanes, which call those of one lane."""
+        """Write `fallback` and `fallback_tangent_part`, which call the functions of one lane for each lane that is `wanted`."""
         module, couples = self._in, self._in.code.couples
 
         def spread(f: Function, x: str, start: str):
-            """Complete a result of all lanes, if M is not diagonal."""
+            """Transform the solution `fallback <x>` to the scene's coordinates, and add `start`, if M is not diagonal."""
             module.invoke(f, "spread", f"fallback {x}")
             with f.each(module.n) as i:
                 module.put_entry(f, f"fallback {x}", i, module.entry(f, start, i) + module.entry(f, f"fallback {x}", i))

@@ -20,7 +20,7 @@ from udkjax.native.pseudoinverses.weighted_rows import WeightedRows
 
 
 class DenseEquations(ByRows):
-    """The functions of a module with a dense method."""
+    """The accelerations and the projection of a module by a dense method."""
 
     shared = ("couplings", "rows", "rates")
     has_cold_functions = False
@@ -43,7 +43,7 @@ class DenseEquations(ByRows):
         return s.highest_rank
 
     def write(self):
-        """Write the functions that the module calls instead of programs."""
+        """Write the functions that the module calls in place of the scene's programs by elimination."""
         module = self._in
         self.rows.write()
         for name, write in self._functions.items():
@@ -53,7 +53,10 @@ class DenseEquations(ByRows):
                 write(f)
 
     def _factor(self, f: Function, of_positions: bool = False):
-        """Factorize the rows, and note the largest rank of the attempted step: a stage or a projection may have a larger one."""
+        """Factorize D, with `of_positions` only its rows that restrict positions.
+
+        `highest_rank` becomes the largest rank of all factorizations in the attempted step so far.
+        """
         s = Lane(f, self._in.places)
         self.rows.factor(f, of_positions)
         s.highest_rank = f.max(s.highest_rank, self.rows.matrices(f).row("rank").entry(0))
@@ -97,7 +100,7 @@ class DenseEquations(ByRows):
         self._in.invoke(f, "psi")
 
     def _at(self, f: Function, name: str, other: str, do: Callable[[], None]):
-        """Run `do` with the array `other` instead of `name`."""
+        """Run `do` with the numbers of the array `other` in the array `name`, and restore `name` afterwards."""
         module, saved = self._in, f"saved {name}"
         module.copy(f, name, saved)
         module.copy(f, other, name)
@@ -141,7 +144,10 @@ class DenseEquations(ByRows):
         self._correct_changes(f)
 
     def _correct_changes(self, f: Function):
-        """Compute the tangent parts of changes, with the factors of all rows; those of rows of Psi alone are computed for dq."""
+        """Compute the tangent parts `result dq` and `result dv` of the changes `state dq` and `state dv`.
+
+        All rows have been factorized before; if there are rows of phi, those of Psi are factorized again, alone, for dq.
+        """
         module, rows = self._in, self.rows
         for x in ("dv", "dq") if rows.splits else ("dq", "dv"):
             change = f"state {x}"

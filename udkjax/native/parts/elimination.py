@@ -8,7 +8,7 @@ from udkjax.pinv.auto import NEAREST
 
 
 class EliminatedAccelerations(AccelerationPart):
-    """The programs of a scene that eliminate the rows of the constraints."""
+    """Accelerations by the scene's programs, which eliminate the rows of the constraints."""
 
     measured = "accelerations_and_drift"  # the program of the end of a step that is not projected
 
@@ -37,7 +37,7 @@ class EliminatedAccelerations(AccelerationPart):
 
 
 class ByRows(EliminatedAccelerations):
-    """Accelerations that depend on a method, with the rows of the constraints in memory."""
+    """Base of accelerations by a dense pseudoinverse or a formulation, which need Psi_q and M^(-1/2) in memory."""
 
     measured = "drift"
     arrays = ("psi_q", "root")
@@ -50,5 +50,5 @@ class ByRows(EliminatedAccelerations):
         self._in.invoke(f, "drift")
 
     def nearest(self, f: Function, s: Lane) -> Value:
-        """Return the threshold of the rank, or that of elimination if it is smaller."""
+        """Return the distance below which rows are left out: the rank tolerance, or that of elimination if it is smaller."""
         return f.min(super().nearest(f, s), s.fallback_tol)

@@ -1,11 +1,11 @@
 """Fallback steps: if a pivot is too small for elimination, a rank-revealing method on all rows takes the step.
 
-Two functions of `work` evaluate the states of lanes that are `wanted`; their results are in separate arrays:
+Two functions with the argument `work` evaluate the states of lanes that are `wanted`:
 
-    fallback                 accelerations a, and q and v after one Newton step
-    fallback_tangent_part    the tangent parts of `state dq` and `state dv`
+    fallback                 compute the accelerations, and q and v after one Newton step, as `fallback a`, `q` and `v`
+    fallback_tangent_part    compute the tangent parts of `state dq` and `state dv`, as `fallback dq` and `dv`
 
-all_rows.py has the methods that write them.
+The classes of all_rows.py, one for each method, write these functions.
 """
 
 from abc import abstractmethod
@@ -23,7 +23,7 @@ RESULTS = ("a", "q", "v", "dq", "dv")  # of the fallback
 
 
 class RankRevealing(FallbackPart):
-    """Steps repeated by a rank-revealing method where pivots are too small."""
+    """Base of the fallbacks: steps with pivots that are too small are repeated by a rank-revealing method."""
 
     finds_dependent_rows = True
     shared = ("couplings", "rates")
@@ -37,7 +37,7 @@ class RankRevealing(FallbackPart):
 
     @abstractmethod
     def write_evaluations(self):
-        """Write `fallback` and `fallback_tangent_part`."""
+        """Hook: write the functions `fallback` and `fallback_tangent_part`, by the method of the subclass."""
 
     def write(self):
         module = self._in
@@ -143,10 +143,12 @@ class RankRevealing(FallbackPart):
     # --- loads of joints with friction
 
     def with_loads(self, f: Function, do: Callable[[], None], lanes: Value | None = None):
-        """Run `do` with the loads of friction in steps of the fallback: pivots must be safe, in the given `lanes` or in all.
+        """Run `do` with a higher threshold of pivots: rows without a safe pivot carry no loads of joints with friction.
 
-        Towards a singular configuration the loads of joints may grow without bounds, and friction by them may jam the mechanism
-        in a range that a step crosses. Rows without a safe pivot carry none of these loads, in runs and in their derivatives.
+        Towards a singular configuration the loads of joints may grow without bounds, and the friction that they cause may jam the
+        mechanism in a range that a step crosses. Therefore steps of the fallback, and their derivatives, omit these loads.
+
+        `lanes`: the lanes with this threshold; None: all lanes.
         """
         module = self._in
         if not module.friction.settles:

@@ -1,6 +1,6 @@
-"""Accelerations by other formulations (`udkjax.equations.laws.formulations`) as machine code, not by the Udwadia-Kalaba equation.
+"""Accelerations by formulations other than the Udwadia-Kalaba equation (`udkjax.equations.laws.formulations`), as machine code.
 
-With the unconstrained accelerations a_F, their change x by the constraints, and A = Psi_q,
+With the unconstrained accelerations a_F, their change x due to the constraints, and A = Psi_q,
 
     M x + A^T lambda = 0,        A x = b,        a = a_F + x,
 
@@ -29,31 +29,31 @@ FORMULATE = "formulate"
 
 @dataclass(frozen=True)
 class FormulationCode(ABC):
-    """A formulation as machine code."""
+    """A formulation that has machine code: `prepare` returns the writer of its code in a module."""
 
     closes: ClassVar[bool] = False  # whether the constraints are satisfied wherever a run evaluates accelerations
     needs_diagonal_mass: ClassVar[bool] = False  # whether it receives M itself, which must be diagonal
 
     @property
     def settings(self) -> tuple[str, ...]:
-        """The names of its settings."""
+        """The names of the settings that a run by this formulation has in addition to those of all runs."""
         return FORMULATION_SETTINGS
 
     @abstractmethod
     def prepare(self, module: Module) -> "FormulatedAccelerations":
-        """Lay out the matrices in a module; return the writer of its code."""
+        """Reserve memory for the matrices of the formulation in a module; return the writer of its code there."""
 
 
 class FormulatedAccelerations(ABC):
-    """The accelerations of a module by a formulation."""
+    """The writer of the code that computes accelerations by a formulation."""
 
     @abstractmethod
     def write(self):
-        """Write `formulate(work, out)`: the accelerations of the state."""
+        """Write `formulate(work, out)`: compute the accelerations at the state, and store them at `out`."""
 
 
 class Formulated(ByRows):
-    """Accelerations by a formulation; the systems of the projection are those of a `solver`."""
+    """The accelerations of a module by a formulation; a `solver` solves the linear systems of its projection."""
 
     def __init__(self, module: Module, solver: EliminatedAccelerations, code: FormulationCode):
         super().__init__(module)
@@ -99,7 +99,7 @@ class Formulated(ByRows):
 
 
 class ScaledAccelerations(FormulatedAccelerations):
-    """Accelerations by a linear system in the scene's own units."""
+    """The writer of accelerations by a linear system in the scene's own units."""
 
     def __init__(self, module: Module, layout: DenseLayout):
         self._in, self._layout, self._entries = module, layout, RowEntries(module)
@@ -121,17 +121,17 @@ class ScaledAccelerations(FormulatedAccelerations):
 
     @abstractmethod
     def solve(self, d: DenseMatrices) -> MatrixRow:
-        """Write the solution x from the current Psi_q, M^(-1/2) and b; return the row that holds it."""
+        """Write code that computes x from the current Psi_q, M^(-1/2) and b; return the row that holds x."""
 
     def _array(self, f: Function, name: str, i: Operand = 0) -> Value:
-        """Return one number of an array in all lanes."""
+        """Return the i-th number of an array in all lanes."""
         return self._in.entry(f, name, i)
 
     def _unit(self, f: Function, i: Operand) -> Value:
         return 1.0 / self._array(f, "inverse unit", i)
 
     def mass(self, f: Function, i: Operand) -> Value:
-        """Return an entry of M."""
+        """Return entry i of the diagonal of M, in the scene's own units."""
         share = self._unit(f, i) / (self._array(f, "root", i) * self._array(f, "length"))
         return share * share / self._array(f, MASS)
 
@@ -142,13 +142,13 @@ class ScaledAccelerations(FormulatedAccelerations):
             yield row, column, value / self._array(f, "rows", row)
 
     def right(self, f: Function, i: Value) -> Value:
-        """Return an entry of b."""
+        """Return entry i of b, in the scene's own units."""
         return self._array(f, "terms", i + self._in.n) / self._array(f, "rows", i)
 
 
 @dataclass(frozen=True)
 class AugmentedCode(FormulationCode):
-    """Solution for x and lambda together (`Augmented`)."""
+    """The formulation that solves one linear system for x and lambda together (`Augmented`)."""
 
     method: DenseMethod
 
@@ -182,7 +182,7 @@ class AugmentedAccelerations(ScaledAccelerations):
 
 @dataclass(frozen=True)
 class NullSpaceCode(FormulationCode):
-    """x = x_p + N z, with A x_p = b and A N = 0 (`NullSpaceQR`, `NullSpaceSVD`)."""
+    """The formulations by a basis N of the null space: x = x_p + N z, A x_p = b, A N = 0 (`NullSpaceQR`, `NullSpaceSVD`)."""
 
     by_singular_values: bool
 
@@ -203,7 +203,7 @@ class NullSpaceAccelerations(ScaledAccelerations):
 
     @abstractmethod
     def solve_rows(self, d: DenseMatrices):
-        """Write the QR of the rows, and x_p as the row `b`."""
+        """Write the QR factorization of columns that span the rows of A, and the particular solution x_p in the row `b`."""
 
     def solve(self, d: DenseMatrices) -> MatrixRow:
         self.solve_rows(d)
@@ -241,7 +241,7 @@ class NullSpaceAccelerations(ScaledAccelerations):
 
 
 class NullSpaceQRAccelerations(NullSpaceAccelerations):
-    """A^T = Q R with pivoting: x_p = Q_1 R_1^(-T) b."""
+    """Accelerations from A^T = Q R with pivoting: x_p = Q_1 R_1^(-T) b."""
 
     def __init__(self, module: Module):
         super().__init__(module, module.m)
@@ -270,7 +270,7 @@ class NullSpaceQRAccelerations(NullSpaceAccelerations):
 
 
 class NullSpaceSVDAccelerations(NullSpaceAccelerations):
-    """x_p = A^+ b by singular values; the right singular vectors of nonzero singular values span the rows."""
+    """Accelerations from singular values: x_p = A^+ b; right singular vectors of nonzero singular values span the rows of A."""
 
     def __init__(self, module: Module):
         m, n = module.m, module.n

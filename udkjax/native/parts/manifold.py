@@ -9,7 +9,7 @@ from udkjax.native.module.steps import NEWTON_STEPS, NEWTON_TOL
 
 
 def newton(module: Module, f: Function, s: Lane):
-    """Take Newton steps to Psi = 0 in lanes that are `stepping`, until the steps are at rounding level."""
+    """Take Newton steps from `state q` towards Psi = 0, in lanes that are `stepping`, until one is shorter than `NEWTON_TOL`."""
 
     def correct(active: Value):
         module.invoke(f, "newton_q")
@@ -27,7 +27,10 @@ def iterate_newton(
     steps: int = NEWTON_STEPS,
     tol: float = NEWTON_TOL,
 ):
-    """Take Newton steps in some lanes, up to a change of at most `tol`: `correct` computes `corrected q` from `state q`."""
+    """Take Newton steps in the lanes of `mask`, at most `steps`, until one changes `state q` by at most `tol`.
+
+    `correct(lanes)` computes `corrected q` from `state q` in the given lanes. Lanes that have not converged stay `iterating`.
+    """
     s.iterating = f.select(mask, f.const(1.0, DOUBLE, f.width), 0.0)
     k = f.variable(0, INT, 1)
     with f.while_(lambda: f.any_of(s.iterating > 0.5) & (k.value < steps)):
@@ -50,7 +53,10 @@ def take_newton_step(module: Module, f: Function, active: Value, at: str = "stat
 
 
 def with_threshold(f: Function, place: int | None, threshold: Value, do: Callable[[], None]):
-    """Run `do` with another threshold of pivots at the offset `place`. Without an offset (None), only run `do`."""
+    """Run `do` with another threshold of pivots, and restore the old one afterwards.
+
+    `place`: the offset of the threshold in `work`; None: the module has no threshold, so that only `do` runs.
+    """
     if place is None:
         do()
         return
@@ -61,23 +67,24 @@ def with_threshold(f: Function, place: int | None, threshold: Value, do: Callabl
 
 
 def is_moving(module: Module, f: Function, s: Lane) -> Value:
-    """Return whether the state moves so fast that natural loads turn it little within a singular configuration.
+    """Return the lanes in which the state moves so fast that usual loads hardly turn its velocity in a singular configuration.
 
-    A mechanism with the velocity v is where rows are left out for a time of their threshold over v, in natural units: loads of
-    order one change the velocity by as much, which is less than itself above the root of the threshold.
+    Rows are left out within a distance from the configuration, their threshold. In the scene's own units, a mechanism with the
+    velocity v stays within this distance for the time threshold / v. In this time loads of order one change the velocity by as
+    much, which is less than v if v exceeds the root of the threshold.
     """
     fastest = module.largest(f, lambda r: [f.abs(module.vector(f, "state v", r)) * module.vector(f, "inverse unit", r)]) / s.omega
     return fastest * fastest > s.fallback_tol
 
 
 def velocity_tolerance(module: Module, f: Function, s: Lane, name: str) -> Value:
-    """Return the tolerance of the fastest velocity, in its unit."""
+    """Return the tolerance of the fastest velocity in the array `name`, in the scene's own units."""
     fastest = module.largest(f, lambda r: [f.abs(module.vector(f, name, r)) * module.vector(f, "inverse unit", r)])
     return f.fma(s.rtol, fastest / s.omega, s.atol)
 
 
 def largest_violation(module: Module, f: Function) -> Value:
-    """Return the largest row of Psi over its scale; NaN if any row is NaN."""
+    """Return the largest magnitude in the array `psi`, each entry divided by the scale of its row; NaN if any entry is NaN."""
     worst = f.variable(0.0)
     with f.each(module.m) as i:
         x = f.abs(module.entry(f, "psi", i)) / module.entry(f, "rows", i)

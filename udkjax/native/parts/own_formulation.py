@@ -17,7 +17,7 @@ _TRIAL = (2, 3)  # the numbers of rows and coordinates by which the operations o
 
 @dataclass(frozen=True)
 class OwnFormulationCode(FormulationCode):
-    """Accelerations by a user-defined formulation, lowered to machine code; its arrays are numbers of the run."""
+    """A user-defined formulation, lowered to machine code; the numbers in its arrays are settings of the run."""
 
     own: OwnObject
 
@@ -28,7 +28,7 @@ class OwnFormulationCode(FormulationCode):
         """Return the machine code of a formulation.
 
         Raises:
-            UnsupportedError: the message says which operation has none.
+            UnsupportedError: the formulation uses an operation without machine code; the message names it.
         """
         with named("formulation", formulation):
             code = cls(OwnObject.of(formulation))
@@ -43,7 +43,10 @@ class OwnFormulationCode(FormulationCode):
         return OwnAccelerations(module, self)
 
     def evaluate(self, mass: Any, F: Any, A: Any, c: Any, numbers: Any) -> Any:
-        """Return the accelerations for the diagonal of M."""
+        """Return the accelerations (n,) that the user's `solve` computes, from the diagonal `mass` of M, F, A and c.
+
+        `numbers`: the numbers in the arrays of the formulation, one after another.
+        """
         n = len(F)
         a = self.own.filled(numbers).solve(jnp.where(jnp.eye(n, dtype=bool), mass, 0.0), F, A, c)
         if a.shape != (n,):
@@ -51,7 +54,10 @@ class OwnFormulationCode(FormulationCode):
         return a
 
     def written(self, m: int, n: int, width: int = 1, stride: int | None = None) -> Written:
-        """Return the function; rows of A are `stride` numbers apart, by default those of a single member."""
+        """Return the lowered function `evaluate` for m rows, n coordinates and `width` lanes.
+
+        `stride`: the distance between the beginnings of two rows of A, in numbers; None: that of a single member.
+        """
         stride = -(-n // processor.lanes()) * processor.lanes() if stride is None else stride
         shapes = {"mass": (n,), "force": (n,), "D": (m, n), "b": (m,), "numbers": (sum(self.own.sizes),)}
         inputs = [Input(name, shape, stride if name == "D" else None) for name, shape in shapes.items()]
@@ -59,7 +65,7 @@ class OwnFormulationCode(FormulationCode):
 
 
 class OwnAccelerations(ScaledAccelerations):
-    """Accelerations from M, F = M a_F, A and c = b + A a_F."""
+    """The writer of accelerations by a user-defined formulation, from M, F = M a_F, A and c = b + A a_F."""
 
     def __init__(self, module: Module, code: OwnFormulationCode):
         m, n, self._code = module.m, module.n, code
@@ -92,5 +98,5 @@ class OwnAccelerations(ScaledAccelerations):
 
 
 def number_names(count: int) -> Sequence[str]:
-    """Return the names of the settings that are the numbers of a formulation."""
+    """Return the names of the settings that hold the `count` numbers of a user-defined formulation."""
     return [f"formulation number {k}" for k in range(count)]

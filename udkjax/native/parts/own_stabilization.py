@@ -1,12 +1,14 @@
 """A user-defined stabilization (`udkjax.integrate.stabilization`), written in jax.numpy, as machine code.
 
-Its text gets a `ConstraintState`, whose equations are calls of functions of the module, at any state (t, q, v):
+The methods of a stabilization receive a `ConstraintState`. Its answers at a state (t, q, v) become calls of functions of the
+module:
 
-    stabilization_psi, stabilization_rate    Psi, and Psi_dot with phi
-    stabilization_factor, stabilization_solve    the factors of the rows A, and the least change w with A w = residual
-    stabilization_accelerate, stabilization_mass    a, and the diagonal of M
+    stabilization_psi, stabilization_rate           compute Psi; Psi_dot and phi
+    stabilization_factor, stabilization_solve       factorize the rows A; find the least change w with A w = residual
+    stabilization_accelerate, stabilization_mass    compute a; the diagonal of M
 
-Arguments and results have places of their own, so the state of the module is the same before and after.
+Arguments and results of these functions have their own places in memory, and the call of a method does not change the state of
+the module.
 """
 
 import math
@@ -34,7 +36,7 @@ STATE = "at_t", "at_q", "at_v"  # the places of the state of a call
 
 
 class ModuleEquations(eqx.Module):
-    """The equations of a module, at any state, in the text of a stabilization."""
+    """The equations that a stabilization asks for while it is traced: each answer becomes a call of functions of the module."""
 
     n: int = eqx.field(static=True)
     rows: int = eqx.field(static=True)
@@ -71,7 +73,7 @@ class ModuleEquations(eqx.Module):
 
 @dataclass(frozen=True)
 class OwnText:
-    """The code of one method of a stabilization, `text(stabilization, t, q, v, h, a, equations)`: two arrays (n,)."""
+    """One method of a stabilization: `text(stabilization, t, q, v, h, a, equations)` returns two arrays (n,)."""
 
     own: OwnObject
     text: Callable[..., Any]
@@ -86,20 +88,23 @@ class OwnText:
 
     @property
     def inputs(self) -> dict[str, tuple[int, ...]]:
-        """The shapes of its inputs: those of `evaluate`, and the places of calls."""
+        """The shapes of the inputs of the lowered function, by name.
+
+        They are the arguments of `evaluate`, and the places "at_..." of the arguments and results of calls.
+        """
         n, m, size = self.sizes.n, self.sizes.rows, sum(self.own.sizes)
         given = {"t": (), "q": (n,), "v": (n,), "h": (), "a": (n,), "numbers": (size,)}
         of_calls = {"t": (), "q": (n,), "v": (n,), "b": (m,), "psi": (self.sizes.position_rows,), "rate": (m,), "x": (n,)}
         return given | {f"at_{name}": shape for name, shape in of_calls.items()}
 
     def written(self, width: int = 1) -> Written:
-        """Return its function."""
+        """Return the lowered function for `width` lanes."""
         return written(self, tuple(Input(name, shape) for name, shape in self.inputs.items()), width, (self.text, self.sizes))
 
 
 @dataclass(frozen=True)
 class StabilizationCode:
-    """The code of a user-defined stabilization: of the methods that it overrides."""
+    """The code of a user-defined stabilization: that of the methods it overrides; None for the others."""
 
     rates: OwnText | None
     end_of_step: OwnText | None
@@ -110,7 +115,7 @@ class StabilizationCode:
         """Return the machine code of a stabilization for the programs of a scene or a system.
 
         Raises:
-            UnsupportedError: the message says which operation has none.
+            UnsupportedError: a method uses an operation without machine code; the message names it.
         """
         sizes = ModuleEquations(code.coordinate_count, code.row_count, code.position_rows, not code.couples)
         with named("stabilization", stabilization):
@@ -122,35 +127,36 @@ class StabilizationCode:
 
     @property
     def methods(self) -> list[OwnText]:
-        """The methods that are overridden."""
+        """The methods that the stabilization overrides."""
         return [x for x in (self.rates, self.end_of_step) if x is not None]
 
     @property
     def slips(self) -> bool:
-        """True if q' is not v."""
+        """True if the stabilization integrates positions at rates q' other than v."""
         return self.rates is not None and self.rates.written().unchanged[0] != list(self.rates.inputs).index("v")
 
     @property
     def numbers(self) -> list[str]:
-        """The names of its numbers among the settings."""
+        """The names of the settings that hold the numbers of the stabilization."""
         return [f"stabilization number {k}" for k in range(self.number_count)]
 
     @property
     def settings(self) -> tuple[str, ...]:
-        """The names of its settings."""
+        """The names of all settings of the stabilization: the threshold of the rank of rows, then its numbers."""
         return (TOL, *self.numbers)
 
     def settings_of(self, stabilization: Any, tol: Any) -> dict[str, Any]:
-        """Return the settings by name: the threshold of the rank of rows, and the numbers of a stabilization."""
+        """Return the settings by name: `tol`, the threshold of the rank of rows, and the numbers of a stabilization."""
         numbers = [number for x in numbers_of(stabilization) for number in x.reshape(-1)]
         return {TOL: tol, **dict(zip(self.numbers, numbers, strict=True))}
 
 
 class OwnStabilization:
-    """The functions of a module that a stabilization is, and those that its text calls.
+    """The writer of the functions of a stabilization in a module, and of the functions that its methods call.
 
-    stabilize_rates(work, a, slip)    a, at a place, becomes v' at the state, and slip q' - v
-    stabilize_end(work)               the state becomes that from which the next step starts
+    stabilize_rates(work, a, slip)    replace the accelerations at the place `a` by the rates v' at the state, and store q' - v
+                                      at the place `slip`
+    stabilize_end(work)               replace the state at the end of a step by that from which the next step starts
     """
 
     arrays: ClassVar = ("psi_q", "root")
@@ -166,7 +172,7 @@ class OwnStabilization:
         return any(x.calls(f"stabilization_{name}") for x in self._written)
 
     def reserve(self):
-        """Reserve memory, and prepare the solution of rows if it is needed."""
+        """Reserve memory, also for the factors of the rows A if a method asks for least changes."""
         module, method = self._in, self.code.methods[0] if self.code.methods else None
         for name, shape in method.inputs.items() if method else ():
             module.places.add(f"stabilization {name}", math.prod(shape) or 1)
@@ -179,7 +185,7 @@ class OwnStabilization:
     # --- functions
 
     def write(self):
-        """Write the functions that are needed."""
+        """Write the functions of the overridden methods, and those that they call."""
         if self._rows is not None:
             self._rows.write()
         module = self._in
@@ -207,7 +213,7 @@ class OwnStabilization:
         return f"stabilization {name}"
 
     def _enter(self, f: Function, s: Lane, prefix: str):
-        """Set the state to that at the places of a prefix."""
+        """Set the state (t, q, v) of the module to that at the places whose names begin with `prefix`."""
         setattr(s, "state t", getattr(s, self._place(f"{prefix}t")))
         for x in "qv":
             self._in.copy(f, self._place(prefix + x), f"state {x}")
@@ -242,7 +248,13 @@ class OwnStabilization:
             module.put_entry(f, self._place("at_x"), i, 1.0 / (root * root))
 
     def _run(self, f: Function, s: Lane, method: OwnText, a: Value | None) -> Callable[[int, Value], Value]:
-        """Call a method at the state, which stays; return a function (result, index) that reads its results."""
+        """Call a method at the state, which is the same afterwards.
+
+        `a`: the place of the accelerations that the method receives; None: it receives none.
+
+        Returns:
+            A function of k and i that reads entry i of the k-th result.
+        """
         module, width = self._in, f.width
         begins = s.begin > 0.5
         setattr(s, self._place("t"), getattr(s, "state t"))
@@ -275,7 +287,7 @@ class OwnStabilization:
                 f.store(slip, work, f.given["slip"] + i * width, width)
 
     def change_rates(self, f: Function, a: str, slip: str):
-        """Make an array of accelerations at the state v', and the array `slip` q' - v."""
+        """Replace the accelerations in the array `a` by the rates v' of the stabilization at the state; `slip` becomes q' - v."""
         if self.code.rates is not None:
             places = (f.const(self._in.start(x, "work") if x in self._in.places.places else 0, INT) for x in (a, slip))
             f.call("stabilize_rates", f.given["work"], *places)
@@ -289,6 +301,6 @@ class OwnStabilization:
                 module.put_entry(f, f"state {x}", i, f.select(moves, found(k, i), module.entry(f, f"state {x}", i)))
 
     def end_step(self, f: Function):
-        """Change the state at the end of a step."""
+        """Change the state at the end of a step to that from which the stabilization starts the next step."""
         if self.code.end_of_step is not None:
             f.call("stabilize_end", f.given["work"])

@@ -1,11 +1,13 @@
 """Coordinate partitioning (equations/laws/partitioning.py) as machine code: steps in the independent coordinates alone.
 
-The partition of a step follows from its first state, by the pivots of D, and is two arrays of zeros and ones, `dependent q` and
-`dependent v`. At each stage, at the end of the step and at each output,
+A partition is two arrays of zeros and ones, `dependent q` and `dependent v`, which mark the pivot columns of D. That of a step
+follows from its first state, that of an output from the interpolated state:
 
-    choose_partition(work)    the partition at the state
-    close_state(work)         the state, with the dependent coordinates and velocities that satisfy the constraints, in lanes that
-                              are `closing`; velocities are NaN where Newton's method fails, so that the step is repeated
+    choose_partition(work)    choose the partition at the state
+    close_state(work)         change the dependent coordinates and velocities of the state to satisfy the constraints, in lanes
+                              that are `closing`; velocities become NaN where Newton's method fails, and the step is repeated
+
+States are closed at each stage, at the end of a step and at each output.
 
 The accelerations of such a state are those of the Udwadia-Kalaba equation, a_F + M^(-1/2) D^+ b: only the choice of the state
 differs. A Nystroem method, which has stages of coordinates from accelerations alone, is the same in the independent coordinates
@@ -30,7 +32,7 @@ LAST_CHANGE = PARTITION_NEWTON.last_change(np.float64)
 
 
 class PartitioningCode(FormulationCode):
-    """Steps in independent coordinates (`CoordinatePartitioning`)."""
+    """The formulation that integrates independent coordinates alone (`CoordinatePartitioning`)."""
 
     closes = True
 
@@ -39,7 +41,7 @@ class PartitioningCode(FormulationCode):
 
 
 class PartitionedAccelerations(FormulatedAccelerations):
-    """Accelerations by pivoted QR of D, which finds the dependent columns as well, and the solution for these."""
+    """The writer of accelerations by a pivoted QR factorization of D, whose pivots also give the dependent coordinates."""
 
     def __init__(self, module: Module):
         self._in = module
@@ -55,7 +57,7 @@ class PartitionedAccelerations(FormulatedAccelerations):
 
 
 class ByPartition(ProjectionPart):
-    """States are closed by their dependent coordinates and velocities, also at the stages of a step."""
+    """The projection that changes only dependent coordinates and velocities, also at the stages of a step."""
 
     programs = ("rows_of_positions", "rows_of_velocities")
 
@@ -92,7 +94,10 @@ class ByPartition(ProjectionPart):
         f.call("close_state", f.given["work"])
 
     def end_step(self, f: Function, s: Lane):
-        """Close the end of a step, with its accelerations; dependent coordinates, which are not integrated, have no errors."""
+        """Close the state at the end of a step, compute its accelerations, and estimate errors.
+
+        Dependent coordinates, which are not integrated, have no errors.
+        """
         module = self._in
         self.close_stage(f, s)
         module.copy(f, "state v", "result v")
@@ -167,7 +172,7 @@ class ByPartition(ProjectionPart):
             module.put(f, "state v", r, f.select(closing & lost, np.nan, module.vector(f, "state v", r)))
 
     def _newton(self, f: Function, x: str, to: str):
-        """Write a Newton step in the dependent coordinates, or velocities, from the state."""
+        """Store the state after a Newton step in its dependent coordinates (x = "q") or velocities ("v") in the array `to`."""
         module, rows, columns = self._in, self._rows, f"dependent {x}"
         module.invoke(f, "rows_of_positions" if x == "q" else "rows_of_velocities")
         rows.factor(f, of_positions=x == "q", columns=columns)

@@ -1,4 +1,4 @@
-"""The end of a step, and outputs: projected onto the constraints, or as they are."""
+"""States at the ends of steps and at outputs: projected onto the constraints, or left as the method computes them."""
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from udkjax.pinv.auto import NEAR_SHARE
 
 
 class Unprojected(ProjectionPart):
-    """States are as the method computes them; runs that drift too far end."""
+    """No projection: states remain as the method computes them, and runs end that drift too far from the constraints."""
 
     def __init__(self, module: Module, accelerations: EliminatedAccelerations):
         self._in, self._accelerations = module, accelerations
@@ -30,7 +30,7 @@ class Unprojected(ProjectionPart):
             self._in.copy(f, f"result {d}", f"state {d}")
 
     def accelerate_end(self, f: Function, s: Lane):
-        """Compute `result v` and `result a` of the state."""
+        """Compute `result a`, the accelerations at the end of a step; `result v` becomes `state v`."""
         module, accelerations = self._in, self._accelerations
         if module.m:
             accelerations.accelerate_and_measure(f)
@@ -55,13 +55,14 @@ class Unprojected(ProjectionPart):
             lost.value = self._drifted(f, s, accept)
 
     def _drifted(self, f: Function, s: Lane, accept: Value) -> Value:
-        """Return `LOST` or `SINGULAR` in lanes whose new point, which is not projected, has drifted too far, else zero.
+        """Return the status `LOST` or `SINGULAR` in lanes whose new point has drifted too far from the constraints, else zero.
 
         Where the distance from singular configurations is d, a violation x of Psi moves the state by x / d and turns its velocity
         by x / d^2: near the intersection of two branches, the curves of constant Psi are hyperbolas, and lead from one branch to
         the other. Therefore the bound of x is `drift_tol` times d^2 max(d, NEAR_SHARE), with d relative to the largest distance
-        of the run. Steps that are short beside d follow such a curve, and a longer one passes: d is the distance of the farther
-        end of the step. A distance below which the method leaves rows out counts as this distance.
+        of the run. Steps that are short compared to d follow such a curve, while a longer step passes the configuration: d is the
+        distance of that end of the step which is farther from it, and at least the distance below which the method leaves rows
+        out.
         """
         module = self._in
         nearest = module.accelerations.nearest(f, s)
@@ -74,7 +75,7 @@ class Unprojected(ProjectionPart):
 
 
 class Projected(ProjectionPart):
-    """States are projected by Newton's method."""
+    """Projection of the ends of steps, and of outputs, by Newton's method."""
 
     def __init__(self, module: Module):
         self._in = module
@@ -139,10 +140,11 @@ class Projected(ProjectionPart):
             lost.value = f.select(misses, f.const(Status.MISSING_RANK, DOUBLE, f.width), lost.value)
 
     def _misses_rows(self, f: Function, s: Lane) -> Value:
-        """Return whether the projected velocities of the new point violate Psi_dot so that such a step would open Psi too far.
+        """Return the lanes in which the projected velocities of the new point violate Psi_dot too much.
 
-        Psi_dot is linear in the velocities: a row stays violated only if it was left out as dependent, although it is not. The
-        motion then has more freedom than the mechanism, and when the row counts again, projection takes away what it gained.
+        They do so if, at this rate, Psi would exceed its bound in a step of the same length. Psi_dot is linear in the velocities:
+        a row stays violated only if it was left out as dependent although it is independent. The motion then has more freedom
+        than the mechanism, and projection would undo a part of the motion as soon as the row is used again.
         """
         module = self._in
         module.copy(f, "state v", "saved v")
@@ -153,7 +155,7 @@ class Projected(ProjectionPart):
 
 
 def lost_in(module: Module, f: Function, s: Lane, accept: Value) -> Value:
-    """Return `LOST` in lanes whose projected new point violates Psi, else zero."""
+    """Return the status `LOST` in lanes whose new point violates Psi too much despite its projection, else zero."""
     module.invoke(f, "psi")
     bound = f.min(f.const(LOST_TOL, DOUBLE, f.width), f.max(s.open_tol, (s.rtol + s.atol) * CLOSED_TOL))
     is_lost = accept & (largest_violation(module, f) > bound)
@@ -161,7 +163,17 @@ def lost_in(module: Module, f: Function, s: Lane, accept: Value) -> Value:
 
 
 def estimate_errors(module: Module, f: Function, s: Lane, end: str | None, to_q: str, to_v: str):
-    """Estimate the errors of q and v from the accelerations of all stages; `end` names those of the last stage."""
+    """Estimate the errors of a step in q and v from the accelerations of its stages.
+
+    Args:
+        module: The module.
+        f: The function to which the code is added.
+        s: The numbers of its lanes.
+        end: The array of the accelerations at the end of the step, for methods whose last stage is there; None: the array of the
+            last stage.
+        to_q: The array that receives the errors of q.
+        to_v: The array that receives the errors of v.
+    """
     h, zero = module.broadcast(f, s.step), f.const(0.0, DOUBLE, module.plan.vector)
     for method, mask in module.stiffness.methods(f, s):
         names = list(module.stage_accelerations)

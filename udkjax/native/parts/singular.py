@@ -20,8 +20,11 @@ from udkjax.native.module.tableau import Method
 def retry_or_fall_back(f: Function, s: Lane, failed: Value, tries: Value | None) -> Shortened:
     """Shorten a step that encountered a pivot too small for elimination, or leave it to the fallback.
 
+    `failed`: the lanes whose attempt failed; `tries`: those whose attempt was a trial of an implicit step (None: no trials).
+
     Returns:
-        Masks of the lanes whose attempt is complete, and of lanes that shorten it; and the time to the singular configuration.
+        The mask of the lanes whose attempt is complete, the mask of the lanes that repeat it with a shorter step, and the time
+        (s) to the next singular configuration.
     """
     where, stepping, fallback, error = f.select, s.stepping > 0.5, s.fallback > 0.5, s.error
     fallback_due = failed & ~fallback
@@ -41,9 +44,10 @@ def retry_or_fall_back(f: Function, s: Lane, failed: Value, tries: Value | None)
 
 
 def limit_of_error(f: Function, s: Lane, method: Method, time_left: Value, drift: Value | None) -> Value:
-    """Return the error up to which a step is accepted: one or, across a singular configuration, its rounding error if larger.
+    """Return the error, relative to the tolerance, up to which a step is accepted.
 
-    A violation of the constraints, `drift`, turns the velocity as a rounding error of this size does.
+    It is one or, for a step across a singular configuration, the rounding error of the step if that is larger. `drift`, the
+    violation of the constraints (None: it is rounding), turns the velocity as a rounding error of this size does.
 
     A shorter step across the singular configuration would have a larger rounding error, as its nodes are nearer to it. The run
     would creep there by ever shorter steps, whose errors add up to much more, and leave out rows that are independent. This only
@@ -60,15 +64,18 @@ def limit_of_error(f: Function, s: Lane, method: Method, time_left: Value, drift
 
 
 def is_clear(f: Function, s: Lane, distance: Value, h: Value | None = None) -> Value:
-    """Return whether a step h, by default of the current length, may begin at a distance from singular configurations."""
+    """Return the lanes in which a step of length `h` (None: `s.h`) may begin at this distance from singular configurations.
+
+    There, the rounding errors of accelerations change the velocity in the step by less than the tolerance.
+    """
     h = s.h if h is None else h
     return (distance > NEAREST_STAGE) & (distance * distance * distance * s.tolerance > h * s.omega * ROUNDING_GROWTH)
 
 
 def time_to_singularity(s: Lane, accepted: bool = False) -> Value:
-    """Return the time until a singular configuration, a root of the parabola through three distances.
+    """Return the time (s) until a singular configuration, a root of the parabola through three distances.
 
-    They are those of the latest accepted states or, if the attempt is `accepted`, of its end and the two states before.
+    The distances are those of the latest accepted states or, if the attempt is `accepted`, of its end and the two states before.
     """
     t2, t1, t0, d2, d1, d0 = s.point1_t, s.point2_t, s.point3_t, s.distance0, s.distance1, s.distance2
     if accepted:
@@ -80,13 +87,18 @@ def time_to_singularity(s: Lane, accepted: bool = False) -> Value:
 
 
 def step_across(f: Function, method: Method, time_left: Value, h: Value) -> Value:
-    """Return a step of about length h, such that a singular configuration ahead is in the middle of a wide gap between nodes."""
+    """Return the length of a step, about h, in which a singular configuration lies in the middle of a wide gap between nodes.
+
+    `time_left`: the time from the start of the step to the singular configuration (s).
+    """
     low, high = (float(x) for x in method.clearings)
     return time_left / f.select(time_left / h < low, f.const(low, DOUBLE, f.width), high)
 
 
 def step_around(f: Function, s: Lane, method: Method, distance: Value, time_left: Value, h: Value) -> Value:
-    """Return a step of about h at most, planned around a singular configuration ahead; `distance` is that of its start.
+    """Return the length of the next step, at most about h, planned around a singular configuration ahead.
+
+    `distance`: the distance from singular configurations at the start of the step; `time_left`: the time to the next one (s).
 
     Rounding errors are largest at the nodes of a step that are next to the singular configuration, and shorter steps have larger
     ones. Therefore the step that crosses it has it in the middle of a wide gap between its nodes, and the step before ends where

@@ -1,11 +1,11 @@
-"""The steps of a run with a user-defined stabilization: its rates are integrated, and its states begin the next step.
+"""The steps of a run with a user-defined stabilization, which may change the rates that are integrated, and the end of a step.
 
 With slip = q' - v, which is zero for most stabilizations, the stages of a step from a point are
 
     q_i = q + h c_i v + h^2 sum_j (A A)_ij v'_j + h sum_j A_ij slip_j,        v_i = v + h sum_j A_ij v'_j.
 
-The position by which q has slipped from the integral of v, `slipped`, is interpolated on its own: the polynomial between points
-takes v for the rate of the positions.
+The difference of q from the integral of v, `slipped`, is interpolated on its own: the polynomial between points takes v for the
+rate of the positions.
 """
 
 from udkjax.native.language.ir import DOUBLE, Function, Value, Variable
@@ -20,7 +20,7 @@ _LAST = f"point{POINTS - 1}"
 
 
 class Stabilized(Unprojected):
-    """States as the method computes them from the rates of a stabilization, and as this changes them after each step."""
+    """No projection: the method integrates the rates of a stabilization, which may also change the state after each step."""
 
     def __init__(self, module: Module, accelerations: EliminatedAccelerations, code: StabilizationCode):
         super().__init__(module, accelerations)
@@ -47,7 +47,7 @@ class Stabilized(Unprojected):
         self._own.write()
 
     def begin_step(self, f: Function, s: Lane):
-        """Compute the rates at point 3 for the length of this step."""
+        """Compute the rates at point 3, which may depend on the length of the step that begins there."""
         if not self._changes_rates:
             return
         module = self._in
@@ -86,7 +86,11 @@ class Stabilized(Unprojected):
         super().judge(f, s, accept, lost)
 
     def _shift(self, f: Function, s: Lane, accept: Value):
-        """Make the accelerations, and the slips, those of the new point 3; point 2 gets the rates with which the step began."""
+        """Move accelerations and slips to the points after an accepted step.
+
+        The accelerations at the end of the step, without stabilization, become `present a`, and point 3 gets the slips there.
+        Point 2 gets the rates with which the step began.
+        """
         module, before = self._in, f"point{POINTS - 2}"
         accepted, stepped = (self._lanes(f, x) for x in (accept, accept & (s.begin < 0.5)))
         module.copy(f, "end a", "present a", accepted)
@@ -102,13 +106,13 @@ class Stabilized(Unprojected):
         module.copy(f, "stage0 slip", f"{before} slip", stepped)
 
     def _lanes(self, f: Function, mask: Value) -> Value:
-        """Repeat a mask of lanes to match registers."""
+        """Return a mask of lanes, repeated to match registers of coordinates."""
         if mask.width == self._in.plan.vector:
             return mask
         return self._in.broadcast(f, f.select(mask, f.const(1.0, DOUBLE, f.width), 0.0)) > 0.5
 
     def slipped_between(self, f: Function, s: Lane, r: Value) -> Value:
-        """Return by how much q has slipped at the time `next`, for one register: a cubic in each step."""
+        """Return one register of the differences of q from the integral of v at the time `next`: a cubic in each step."""
         module, found = self._in, None
         for k in range(POINTS - 1):
             start, end = getattr(s, f"point{k}_t"), getattr(s, f"point{k + 1}_t")

@@ -2,7 +2,8 @@
 
 `dense` stores matrices in the memory of a run, one for each lane, as rows that fill whole registers, and has the operations on
 rows that all methods use. A method defines its matrices, the factorization and the solution. Each lane has its own pivots and
-rank: lanes differ by `select`, as everywhere in machine code. `own` compiles a user-defined method, by a lowering of its text.
+rank: lanes differ by `select`, as everywhere in machine code. `own` lowers a user-defined method to machine code. Methods that
+"write" an algorithm add its instructions to the function `d.f` of their argument `d`.
 """
 
 from udkjax import pinv
@@ -25,10 +26,10 @@ METHODS: dict[type[pinv.Pseudoinverse], type[DenseMethod]] = {
 
 
 def dense_method(method: pinv.Pseudoinverse) -> DenseMethod | None:
-    """Return the machine code of a pseudoinverse; None if there is none.
+    """Return the machine code of a pseudoinverse; None for elimination, and for methods without machine code.
 
     Raises:
-        UnsupportedError: a user-defined method uses an operation without machine code.
+        UnsupportedError: a user-defined method uses an operation without machine code; the message names it.
     """
     if isinstance(method, pinv.MatrixPseudoinverse):
         return OwnCode.of(method)

@@ -20,30 +20,30 @@ ENTRIES = 16  # partial sums of a scalar product of one member, in all lanes: it
 class DenseMethod(ABC):
     """A pseudoinverse as machine code: its matrices, the factorization of D and the solution of D x = b.
 
-    `relative`: whether the rank tolerance is relative to the method's scale of D.
+    `relative`: True if the rank tolerance is relative to the method's scale of D, such as the largest singular value.
     """
 
     relative: bool
 
     @abstractmethod
     def matrices(self, m: int, n: int) -> dict[str, tuple[int, int]]:
-        """Return the shapes of the matrices that it stores in addition to D (m, n), by name."""
+        """Return the shapes of the matrices that the method stores in addition to D (m, n) and its vectors, by name."""
 
     @abstractmethod
     def factor(self, d: "DenseMatrices") -> None:
-        """Write the factorization of D, which is overwritten."""
+        """Write the factorization of D, which may be overwritten; entry 0 of the row `rank` becomes the rank, if there is one."""
 
     @abstractmethod
     def solve(self, d: "DenseMatrices") -> None:
         """Write the solution: the row `x` becomes D^+ b; the row `b` is overwritten."""
 
     def solve_transposed(self, d: "DenseMatrices") -> None:
-        """Write the transposed solution: the row `b` becomes (D^+)^T x."""
+        """Write the transposed solution: the row `b` becomes (D^+)^T x; methods that lack it raise `NotImplementedError`."""
         raise NotImplementedError(type(self).__name__)
 
 
 class DenseLayout:
-    """The matrices of a method in the memory of a module.
+    """The places of the matrices of a method in the memory of a module, where their memory is reserved.
 
     Args:
         module: The module.
@@ -74,14 +74,14 @@ class DenseLayout:
         module.begins.append(self.number_columns)
 
     def number_columns(self, f: Function):
-        """Store the indices of the columns, which are constant."""
+        """Store 0, 1, 2, ... in the row `index`, the indices of the columns; called once in the code of a run."""
         start = self.module.places[f"{self.prefix} index"] * self.module.plan.width
         with f.each(self.shapes["index"][1]) as j:
             f.store(f.like(j, DOUBLE, self.width), f.given["work"], j * self.width + start, self.width)
 
 
 class MatrixRow:
-    """A row of a matrix: its address and its number of registers."""
+    """A row of a matrix: its address and its number of registers; `row[r]` loads or stores register r."""
 
     def __init__(self, d: "DenseMatrices", address: Value, registers: int):
         self._d, self.address, self.registers = d, address, registers
@@ -95,17 +95,17 @@ class MatrixRow:
         d.f.store(x, self.address, d.f.like(r, INT, 1) * d.vector if isinstance(r, Value) else r * d.vector, d.vector)
 
     def entry(self, j: Operand) -> Value:
-        """Return one entry in all lanes."""
+        """Return entry j of the row in all lanes."""
         f = self._d.f
         return f.load(self.address, f.like(j, INT, 1) * f.width if isinstance(j, Value) else int(j) * f.width, f.width)
 
     def put(self, j: Operand, x: Operand):
-        """Store one entry in all lanes."""
+        """Store x as entry j of the row in all lanes."""
         f = self._d.f
         f.store(x, self.address, f.like(j, INT, 1) * f.width if isinstance(j, Value) else int(j) * f.width, f.width)
 
     def at(self, places: Value) -> Value:
-        """Return one entry for each lane, at the indices `places`."""
+        """Return for each lane the entry of the row whose index is in `places`."""
         f = self._d.f
         if f.width == 1:
             return f.load(self.address, places)
@@ -116,7 +116,7 @@ class MatrixRow:
         return entries
 
     def put_at(self, places: Value, x: Value):
-        """Store one entry for each lane, at the indices `places`."""
+        """Store x for each lane as the entry of the row whose index is in `places`."""
         f = self._d.f
         if f.width == 1:
             f.store(x, self.address, places)
@@ -136,7 +136,10 @@ class MatrixRow:
 
 
 class DenseMatrices:
-    """The matrices of a method in one function, which has the argument `work`."""
+    """Access to the matrices of a method within the function f, which has the argument `work`.
+
+    `part`: a prefix; names stand for the matrices of these names with the prefix, if there are such matrices.
+    """
 
     def __init__(self, layout: DenseLayout, f: Function, part: str = ""):
         self.layout, self.f, self.module, self._part = layout, f, layout.module, part
@@ -154,7 +157,7 @@ class DenseMatrices:
         return self.f.const(x, DOUBLE, self.vector)
 
     def spread(self, x: Value) -> Value:
-        """Repeat a number of each lane to match registers."""
+        """Return a number of each lane, repeated to match the registers of rows."""
         return self.module.broadcast(self.f, x)
 
     def number(self, k: Value) -> Value:
@@ -170,22 +173,25 @@ class DenseMatrices:
 
     @property
     def tol(self) -> Value:
-        """The rank tolerance."""
+        """The rank tolerance of each lane."""
         f, place = self.f, self.module.places[self.layout.tol] * self.module.plan.width
         return f.load(f.given["work"], f.given["lane"] + place if "lane" in f.given else place, f.width)
 
     def threshold(self, method: DenseMethod, square_of_scale: Value) -> Value:
-        """Return the square of the threshold, from the square of the method's scale of D."""
+        """Return the square of the threshold below which a length or a singular value counts as zero.
+
+        `square_of_scale`: the square of the method's scale of D, to which a relative tolerance refers.
+        """
         tol = self.tol
         return tol * tol * square_of_scale if method.relative else tol * tol
 
     @property
     def method_number(self) -> Value:
-        """The index of the method that each lane uses."""
+        """The index of the method that each lane uses, of several (`OneOfCode`)."""
         return self.f.load(self.f.given["work"], self.module.places["method"] * self.f.width, self.f.width)
 
     def part(self, prefix: str) -> "DenseMatrices":
-        """Return the matrices whose names have a prefix."""
+        """Return access in which names stand for the matrices of these names with a prefix, if there are such matrices."""
         return DenseMatrices(self.layout, self.f, prefix)
 
     def _name(self, name: str) -> str:
@@ -215,7 +221,7 @@ class DenseMatrices:
         return MatrixRow(self, f.at(f.given["work"], place), registers)
 
     def gather(self, name: str, places: Value, to: MatrixRow):
-        """Copy one row for each lane, at the indices `places` of a matrix."""
+        """Copy for each lane the row of a matrix whose index is in `places` to the row `to`."""
         f, registers = self.f, self.layout.registers[self._name(name)]
         if f.width == 1:
             self.copy(self.row(name, places), to)
@@ -226,7 +232,7 @@ class DenseMatrices:
                 f.store(f.load(source, j * f.width + k), to.address, j * f.width + k)
 
     def over_registers(self, registers: int, do: Callable[[Operand], None]):
-        """Run `do` for each register of a row, unrolled, or in a loop over several at a time."""
+        """Run `do` for the index of each register of a row: unrolled or, for long rows, in a loop over several at a time."""
         f = self.f
         if registers <= UNROLLED:
             for r in range(registers):
@@ -241,7 +247,10 @@ class DenseMatrices:
             do(r)
 
     def sum(self, registers: int, term: Callable[[Operand, Value], Value]) -> Value:
-        """Sum over registers and, for one member, over their entries: `term(r, sum)` adds the terms of register r."""
+        """Return the sum of terms over registers and, with a single lane, over their entries.
+
+        `term(r, total)` returns `total` plus the terms of register r.
+        """
         f, count = self.f, SUMS if self.f.width > 1 else max(1, ENTRIES // self.vector)
         totals = [self.register(0.0)] * max(1, min(count, registers))  # rows of a free body are empty
         if registers <= UNROLLED:
@@ -275,7 +284,7 @@ class DenseMatrices:
         self.over_registers(min(x.registers, y.registers), add)
 
     def largest(self, row: MatrixRow, count: int) -> Value:
-        """Return the largest of the first `count` entries of a row."""
+        """Return the largest of the first `count` entries of a row; zero if all are negative."""
         worst = self.f.variable(0.0)
         with self.f.each(count) as j:
             worst.value = self.f.max(row.entry(j), worst.value)

@@ -9,9 +9,10 @@ from udkjax.native.pseudoinverses.qr import add_to_rows, choose_pivot, combine_r
 
 @dataclass(frozen=True)
 class GramSchmidtCode(DenseMethod):
-    """D = Q R with column pivoting, then R = L Z^T: D^+ = Z L^(-1) Q^T.
+    """The method of Gram and Schmidt: D = Q R with column pivoting, then R = L Z^T, so that D^+ = Z L^(-1) Q^T.
 
-    The rows of R up to the rank are independent, so the second factorization needs no pivots.
+    The rows of R up to the rank are independent, so the second factorization needs no pivots. `twice`: True to orthogonalize each
+    vector twice, which makes the columns of Q and Z orthogonal to rounding.
     """
 
     twice: bool = True
@@ -36,7 +37,7 @@ class GramSchmidtCode(DenseMethod):
         self._orthogonalize_rows(d)
 
     def _orthogonalize_columns(self, d: DenseMatrices):
-        """Write D = Q R: rows of `q` are the columns of Q, and D is reduced to its remainder."""
+        """Write the factorization D = Q R: rows of `q` become the columns of Q, `r` becomes R, and D what remains."""
         f, column, above = d.f, d.row("column"), d.row("above")
         threshold = f.variable(d.threshold(self, start_pivoting(d)))
         going, rank = f.variable(d.yes(), BOOL), f.variable(0.0)
@@ -81,7 +82,7 @@ class GramSchmidtCode(DenseMethod):
         d.row("rank").put(0, rank.value)
 
     def _orthogonalize_rows(self, d: DenseMatrices):
-        """Write R = L Z^T: rows of `r` become the columns of Z."""
+        """Write the factorization R = L Z^T: rows of `r` become the columns of Z."""
         f, above = d.f, d.row("above")
         rank = f.variable(d.row("rank").entry(0))
         with f.each(d.steps) as k:

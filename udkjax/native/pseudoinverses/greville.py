@@ -8,7 +8,7 @@ from udkjax.native.pseudoinverses.dense import DenseMatrices, DenseMethod
 
 @dataclass(frozen=True)
 class GrevilleCode(DenseMethod):
-    """The columns of D^+ are rows of `plus`; each row of D adds one and corrects the previous ones."""
+    """Greville's recursion: the rows of `plus` are the columns of D^+; each row of D adds one, and corrects those before."""
 
     def matrices(self, m: int, n: int) -> dict[str, tuple[int, int]]:
         return {"plus": (m, n), "d": (1, m), "c": (1, n), "rank": (1, 1)}

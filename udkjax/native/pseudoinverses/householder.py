@@ -16,11 +16,12 @@ from udkjax.native.pseudoinverses.qr import (
 
 @dataclass(frozen=True)
 class HouseholderCode(DenseMethod):
-    """D = Q R = Q T G, with T the pivot columns of R and G = T^(-1) R.
+    """Householder's method: D = Q R = Q T G, with T the pivot columns of R and G = T^(-1) R.
 
-    The null space of D is spanned by a row for each column f without a pivot: e_f - sum_i G_if e_(pivot i).
+    The null space of D is spanned by one vector for each column f without a pivot, a free column: e_f - sum_i G_if e_(pivot i).
 
-    The basic solution solves with T; reflections of the basis of the null space then remove its component in the null space.
+    The basic solution, from a system with T, is zero in free columns; reflections of the basis of the null space then remove the
+    component of this solution in the null space.
     """
 
     def matrices(self, m: int, n: int) -> dict[str, tuple[int, int]]:
@@ -60,7 +61,10 @@ class HouseholderCode(DenseMethod):
         self._reflect_null_space(d, d.wide(float(d.n)) - rank.value)
 
     def _reflect_null_space(self, d: DenseMatrices, free: Value):
-        """Reflect the basis of the null space to the first coordinates, one vector for each free column."""
+        """Write reflections that map the basis of the null space, one vector for each free column, to the first coordinates.
+
+        `free`: the number of free columns.
+        """
         f = d.f
         d.row("free").put(0, free)
         column = f.variable(-1.0)

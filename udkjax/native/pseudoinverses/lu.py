@@ -1,4 +1,7 @@
-"""D^(-1) of a square matrix by LU with partial pivoting; dominated by rounding if D is singular, or NaN if this is checked."""
+"""Solution of D x = b for a square matrix, by LU with partial pivoting.
+
+If D is singular, the solution is dominated by rounding errors, or is NaN if the method refuses singular matrices.
+"""
 
 from dataclasses import dataclass
 
@@ -11,7 +14,7 @@ from udkjax.native.pseudoinverses.qr import reversed_each
 
 @dataclass(frozen=True)
 class LUCode(DenseMethod):
-    """P D = L U: rows of `upper` are the pivot rows when chosen; row k of `lower` holds the multipliers of step k.
+    """The factorization P D = L U: row k of `upper` is the pivot row of step k; row k of `lower` holds its multipliers.
 
     If `refuses_singular`, a pivot that is a rounding error of the other entries in its column of U counts as zero, and the
     solution is NaN: see `udkjax.equations.laws.formulations.solve_regular`.
@@ -61,7 +64,10 @@ class LUCode(DenseMethod):
                         row[r] = f.fma(wide, upper[r], row[r])
 
     def _unless_singular(self, d: DenseMatrices, k: Value, size: Value, inverse: Value) -> Value:
-        """Return the inverse of pivot k, or NaN; `largest` holds the largest entries of the columns of U so far."""
+        """Return `inverse`, the inverse of pivot k, or NaN if the pivot, of the magnitude `size`, is a rounding error.
+
+        The row `largest` holds the largest magnitude in each column of U so far.
+        """
         f, upper, largest = d.f, d.row("upper", k), d.row("largest")
 
         def include(r: Operand):
@@ -71,7 +77,7 @@ class LUCode(DenseMethod):
         return f.select(size > largest.entry(k) * (d.m * float(np.finfo(float).eps)), inverse, float("nan"))
 
     def _forward(self, d: DenseMatrices) -> tuple[MatrixRow, MatrixRow]:
-        """Solve L y = P b; return the rows `x`, which is zero, and `y`."""
+        """Write the solution of L y = P b; return the rows `x`, which is set to zero, and `y`."""
         b, x, y = d.row("b"), d.row("x"), d.row("y")
         with d.f.each(d.m) as k:
             entry = b.at(d.whole(d.row("order").entry(k)))
@@ -96,7 +102,7 @@ class LUCode(DenseMethod):
             b.put_at(d.whole(d.row("order").entry(k)), y.entry(k) - d.dot(d.row("lower", k), b))
 
     def sign(self, d: DenseMatrices) -> Value:
-        """Return the sign of det D: the product of the signs of the pivots, and -1 for each inversion of rows."""
+        """Return the sign of det D: the product of the signs of the pivots, and of -1 for each inversion of rows."""
         f, order, sign = d.f, d.row("order"), d.f.variable(1.0)
         with f.each(d.m) as k:
             place = order.entry(k)
@@ -108,7 +114,9 @@ class LUCode(DenseMethod):
 
 @dataclass(frozen=True)
 class OrderedLUCode(LUCode):
-    """LU whose solutions round equally in any number of lanes: without scalar products, whose terms lanes add in another order.
+    """LU whose solutions are the same for any number of lanes, bit for bit.
+
+    It avoids scalar products, whose terms are added in an order that depends on the number of lanes.
 
     Row k of `columns` is column k of U.
     """

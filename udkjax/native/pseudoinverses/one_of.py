@@ -41,7 +41,10 @@ class OneOfCode(DenseMethod):
             d.over_registers(x.registers, take)
 
     def _chosen(self, d: DenseMatrices) -> Iterator[tuple[DenseMethod, DenseMatrices, Value]]:
-        """Run the block for each method within a branch that is taken if any lane has chosen it."""
+        """Yield each method with its matrices and the mask of the lanes that have chosen it.
+
+        The code that the caller adds is in a branch that is taken if any lane has chosen the method.
+        """
         for k, method in enumerate(self.methods):
             chosen = d.method_number.is_(float(k))
             with d.f.if_(d.f.any_of(chosen)):

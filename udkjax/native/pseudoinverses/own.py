@@ -17,7 +17,10 @@ _TRIAL = (2, 3)  # the shape of a matrix by which the operations of a method are
 
 @dataclass(frozen=True)
 class OwnCode(DenseMethod):
-    """D^+ is the matrix `plus`, computed by the lowered text of the method, whose only number is the rank tolerance."""
+    """A user-defined method, lowered to machine code, which computes D^+ as the matrix `plus`.
+
+    The only number among the fields of the method is the rank tolerance.
+    """
 
     own: OwnObject
 
@@ -26,7 +29,7 @@ class OwnCode(DenseMethod):
         """Return the machine code of a method.
 
         Raises:
-            UnsupportedError: the message says which operation has none.
+            UnsupportedError: the method uses an operation without machine code, or arrays other than the rank tolerance.
         """
         marked = eqx.tree_at(lambda x: x.rank_tol, method, np.float64(0.0), is_leaf=lambda x: x is None)
         with named("pseudoinverse", method):
@@ -37,14 +40,17 @@ class OwnCode(DenseMethod):
         return code
 
     def evaluate(self, D: Any, tol: Any) -> Any:
-        """Return D^+ and the rank."""
+        """Return D^+ (n, m) and the rank, from D (m, n) and the rank tolerance, by the user's code."""
         plus, rank = self.own.filled(tol).factor(D)
         if plus.shape != D.shape[::-1]:
             raise ValueError(f"matrix(D) must have the shape {D.shape[::-1]}, not {plus.shape}")
         return plus, rank
 
     def written(self, m: int, n: int, width: int = 1, stride: int | None = None) -> Written:
-        """Return the function of D and the rank tolerance; rows of D are `stride` apart, by default as for a single member."""
+        """Return the lowered function `evaluate` for D (m, n) in `width` lanes.
+
+        `stride`: the distance between the beginnings of two rows of D, in numbers; None: that of a single member.
+        """
         stride = -(-n // processor.lanes()) * processor.lanes() if stride is None else stride
         return written(self, (Input("D", (m, n), stride), Input("tol", (1,))), width)
 

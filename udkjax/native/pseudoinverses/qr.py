@@ -8,7 +8,11 @@ from udkjax.native.pseudoinverses.dense import DenseMatrices, MatrixRow
 
 
 def qr_matrices(m: int, n: int) -> dict[str, tuple[int, int]]:
-    """Return the matrices of `pivoted_qr`: reflectors, their factors, the diagonal of R, pivots, and lengths of columns."""
+    """Return the shapes of the matrices of `pivoted_qr`, by name.
+
+    They are the reflectors and their factors, the diagonal of R, the pivot columns in their order, the rank, the squared lengths
+    of columns, marks of unused columns, and room for a product.
+    """
     steps = min(m, n)
     return {
         "v": (steps, m),
@@ -23,7 +27,7 @@ def qr_matrices(m: int, n: int) -> dict[str, tuple[int, int]]:
 
 
 def start_pivoting(d: DenseMatrices) -> Value:
-    """Mark all columns of D as unused, with the squares of their lengths; return the largest."""
+    """Mark all columns of D as unused, compute the squares of their lengths, and return the largest of these."""
     unused, squares = d.row("unused"), d.row("squares")
 
     def of_column(r: Operand):
@@ -51,7 +55,10 @@ def choose_pivot(d: DenseMatrices) -> tuple[Value, Value]:
 
 
 def use_column(d: DenseMatrices, pivot: Value, r: Operand, square: Value):
-    """Store the squared lengths of a register of columns, with -1 for used ones, and mark the pivot as used."""
+    """Store the squared lengths of the columns in register r, -1 for used ones, and mark the pivot column as used.
+
+    `pivot`: the index of the pivot column; -1 in lanes without a pivot.
+    """
     f, unused, squares = d.f, d.row("unused"), d.row("squares")
     remains = f.select(d.row("index")[r].is_(d.spread(pivot)), 0.0, unused[r])
     unused[r] = remains
@@ -59,7 +66,7 @@ def use_column(d: DenseMatrices, pivot: Value, r: Operand, square: Value):
 
 
 def combine_rows(d: DenseMatrices, weights: MatrixRow, r: Operand, start: Operand = 0) -> Value:
-    """Return the weighted sum of the rows of D from `start` on, for a register of columns."""
+    """Return the weighted sum of the rows of D from `start` on, for the columns in register r."""
     total = d.f.variable(0.0, width=d.vector)
     with d.f.each(d.m, start) as i:
         total.value = d.f.fma(d.spread(weights.entry(i)), d.row("D", i)[r], total.value)
@@ -67,7 +74,10 @@ def combine_rows(d: DenseMatrices, weights: MatrixRow, r: Operand, start: Operan
 
 
 def add_to_rows(d: DenseMatrices, weights: MatrixRow, change: Value, r: Operand, start: Operand = 0) -> Value:
-    """Add multiples of `change` to the rows of D from `start` on; return the squared lengths of the columns in these rows."""
+    """Add multiples of `change` to the rows of D from `start` on, in the columns of register r.
+
+    `weights` holds the factor of each row. Returns the squared lengths of these columns in these rows.
+    """
     square = d.f.variable(0.0, width=d.vector)
     with d.f.each(d.m, start) as i:
         row = d.row("D", i)
@@ -114,7 +124,7 @@ def pivoted_qr(d: DenseMatrices, threshold: Callable[[Value], Value]):
 
 
 def apply_q_transposed(d: DenseMatrices):
-    """Write b = Q^T b."""
+    """Write the multiplication of the row `b` by Q^T, in place."""
     b = d.row("b")
     with d.f.each(d.steps) as k:
         v = d.row("v", k)
@@ -122,13 +132,20 @@ def apply_q_transposed(d: DenseMatrices):
 
 
 def apply_q(d: DenseMatrices, name: str = "b", i: Operand = 0):
-    """Write the product of Q with a row."""
+    """Write the multiplication of row i of a matrix, by default of the row `b`, by Q, in place."""
     with reversed_each(d, d.steps) as k:
         apply_reflector(d, "v", "tau", k, name, i)
 
 
 def reflect_row(d: DenseMatrices, name: str, k: Value, is_active: Value, reflectors: str, factors: str) -> Value:
-    """Write the reflection from the right that clears row k of a matrix after column k; return its entry in column k."""
+    """Write a reflector from the right that would clear row k of a matrix after column k; the row itself stays.
+
+    The reflector becomes row k of the matrix `reflectors`, and its factor entry k of the row `factors`, zero in lanes that are
+    not `is_active`.
+
+    Returns:
+        The entry in column k after the reflection.
+    """
     f, row, z = d.f, d.row(name, k), d.row(reflectors, k)
     number = d.spread(d.number(k))
 
@@ -147,7 +164,7 @@ def reflect_row(d: DenseMatrices, name: str, k: Value, is_active: Value, reflect
 
 
 def apply_reflector(d: DenseMatrices, reflectors: str, factors: str, k: Value, name: str, i: Operand = 0):
-    """Write a reflection of row i of a matrix."""
+    """Write the reflection of row i of the matrix `name` by reflector k, in place."""
     z, row = d.row(reflectors, k), d.row(name, i)
     d.axpy(-(d.dot(z, row) * d.row(factors).entry(k)), z, row)
 

@@ -20,7 +20,11 @@ ORTHOGONAL = 1e-15  # largest cosine of the angle between rows that count as ort
 
 @dataclass(frozen=True)
 class SVDCode(DenseMethod):
-    """Rows of D become the right singular vectors times singular values; rows of `u`, times Q, the left singular vectors."""
+    """The method of singular values.
+
+    Rows of D become the right singular vectors times the singular values; rows of `u`, multiplied by Q, are the left singular
+    vectors. Entries of `lengths` become the inverse squares of the singular values, or zero beyond the rank.
+    """
 
     def matrices(self, m: int, n: int) -> dict[str, tuple[int, int]]:
         steps = min(m, n)

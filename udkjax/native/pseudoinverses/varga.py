@@ -15,7 +15,7 @@ from udkjax.native.pseudoinverses.qr import (
 
 @dataclass(frozen=True)
 class VargaCode(DenseMethod):
-    """D = Q R with column pivoting, then R = L Z^T by reflections from the right: D^+ = Z L^(-1) Q^T.
+    """Two QR factorizations: D = Q R with column pivoting, then R = L Z^T by reflections from the right; D^+ = Z L^(-1) Q^T.
 
     The rows of R up to the rank are independent, so the second factorization needs no pivots.
     """

@@ -17,9 +17,10 @@ _ENTRIES, _FACTORS, _CHOSEN = "@entries", "@factors", "@chosen"
 
 
 class RowEntries:
-    """The entries of Psi_q, or of some of its rows; their tables are constants of the module.
+    """The entries of Psi_q, or of some of its rows, that are not always zero; tables of them are constants of the module.
 
-    All instances in a module must choose the same rows.
+    `chosen`: the indices of the rows in Psi, in ascending order; None: all rows. All instances in a module must choose the same
+    rows.
     """
 
     def __init__(self, module: Module, chosen: Sequence[int] | None = None):
@@ -47,15 +48,15 @@ class RowEntries:
             yield row, column, place, f.load(Value(f, _FACTORS, POINTER), e)
 
     def row_of_psi(self, f: Function, row: Value) -> Value:
-        """Return the row of Psi of a chosen row."""
+        """Return the index in Psi of a row, from its index among the chosen rows."""
         return row if len(self._chosen) == self._module.m else f.load(Value(f, _CHOSEN, POINTER), row, base=INT)
 
 
 class WeightedRows(RowEntries):
-    """The rows of a module, and their solution by a dense method in all lanes, or lane by lane.
+    """The matrix D of a module, with its factorization and its systems by a dense method, in all lanes or lane by lane.
 
-    If `by_lane`, functions that use it have one lane, whose index is their argument `lane`. `prefix` and `tol` are those of the
-    layout of the matrices.
+    If `by_lane`, functions that use this object have one lane; their argument `lane` is its index. `prefix` and `tol` are
+    arguments of the `DenseLayout` of the matrices.
     """
 
     def __init__(
@@ -77,22 +78,22 @@ class WeightedRows(RowEntries):
         module.weigh_rows()
 
     def write(self):
-        """Write the functions that factorize and solve."""
+        """Write the functions `factor_<prefix>_rows` and `solve_<prefix>_rows`."""
         for name in ("factor", "solve"):
             f = self._module.new_function(f"{name}_{self._prefix}_rows", self._arguments, self._layout.width)
             getattr(self._method, name)(self.matrices(f))
 
     def matrices(self, f: Function) -> DenseMatrices:
-        """Return the matrices in a function."""
+        """Return access to the matrices within a function."""
         return DenseMatrices(self._layout, f)
 
     def array(self, f: Function, name: str, i: Operand) -> Value:
-        """Return one number of an array in all lanes of the function."""
+        """Return the i-th number of an array, in all lanes of the function."""
         place = f.like(i, INT, 1) * self._module.plan.width + self._module.start(name, "work")
         return f.load(f.given["work"], place + f.given["lane"] if "lane" in f.given else place, f.width)
 
     def put(self, f: Function, name: str, i: Operand, x: Value):
-        """Store one number of an array in all lanes of the function."""
+        """Store x as the i-th number of an array, in all lanes of the function."""
         place = f.like(i, INT, 1) * self._module.plan.width + self._module.start(name, "work")
         f.store(x, f.given["work"], place + f.given["lane"] if "lane" in f.given else place, f.width)
 
@@ -102,12 +103,12 @@ class WeightedRows(RowEntries):
             yield row, column, self.array(f, "psi_q", place) * factor * self.array(f, "weights", self.row_of_psi(f, row))
 
     def factor(self, f: Function, of_positions: bool = False, columns: str | None = None):
-        """Factorize D, from the current entries of Psi_q.
+        """Compute D from the current entries of Psi_q, and factorize it.
 
         Args:
-            f: The function.
-            of_positions: Whether only of the rows that restrict positions.
-            columns: The array of factors of the columns; None: all are one.
+            f: The function to which the code is added.
+            of_positions: True: rows that do not restrict positions are zero.
+            columns: The array of factors by which the columns of D are multiplied; None: all are one.
         """
         d = self.matrices(f)
         with f.each(d.m) as i:
@@ -118,7 +119,7 @@ class WeightedRows(RowEntries):
         self._call(f, "factor")
 
     def solve(self, f: Function, right: str, start: int = 0) -> MatrixRow:
-        """Return D^+ W b, with b in an array."""
+        """Return the row that holds D^+ W b; b is in the array `right` from index `start` on."""
         d = self.matrices(f)
         b = d.row("b")
         b.clear()  # padding of the last register may have been multiplied by NaN
@@ -128,18 +129,21 @@ class WeightedRows(RowEntries):
         return self.solve_right(f)
 
     def solve_right(self, f: Function) -> MatrixRow:
-        """Return D^+ b, with b in its row."""
+        """Return the row that holds D^+ b, with b in the row `b`."""
         self._call(f, "solve")
         return self.matrices(f).row("x")
 
     def solve_transposed(self, f: Function) -> MatrixRow:
-        """Return (D^+)^T x, with x in its row, if the method solves transposed systems."""
+        """Return the row that holds (D^+)^T x, with x in the row `x`; the method must solve transposed systems."""
         d = self.matrices(f)
         self._method.solve_transposed(d)
         return d.row("b")
 
     def solve_rates(self, f: Function, change: str, of_positions: bool = False) -> MatrixRow:
-        """Return D^+ W Psi_q dq; of positions, rows that restrict velocities alone allow any change."""
+        """Return the row that holds D^+ W Psi_q dq, with dq in the array `change`.
+
+        `of_positions`: True if dq is a change of positions, which is not restricted by rows that restrict velocities alone.
+        """
         d = self.matrices(f)
         b = d.row("b")
         b.clear()
@@ -151,7 +155,7 @@ class WeightedRows(RowEntries):
         return self.solve_right(f)
 
     def correct(self, f: Function, x: MatrixRow, start: str, to: str, sign: float = -1.0):
-        """Write `start` plus or minus M^(-1/2) x; `to` is an array, or `out`."""
+        """Store `start` + M^(-1/2) x, or the difference if `sign` is negative, in the array `to`, or at the pointer `out`."""
         module = self._module
         place, couples = 0 if to == "out" else module.start(to, "work"), module.code.couples
         if couples:

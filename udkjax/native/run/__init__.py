@@ -6,4 +6,7 @@ states, through which the polynomial of dense output passes; an *output* is a st
 time at which the motion is not smooth, a *piece* a part of the state space in which it is smooth: a step ends at
 each breakpoint and at the end of each piece, and the run *begins* anew. The *fallback* takes steps whose pivots are too small for
 elimination.
+
+Functions with an argument `f` add instructions to this function of the module; its argument `s` gives access to the numbers of
+all lanes, which module/layout.py describes. Sets of lanes, such as `accept`, are masks.
 """

@@ -9,7 +9,7 @@ from udkjax.native.module.steps import AIM_ACROSS, BEGINS_BEHIND, ENDS_BEFORE, P
 
 
 def aim(module: Module, f: Function, s: Lane):
-    """Set `t1`, `step`, `begin`, `last` and `lands` for the next step of each lane."""
+    """Set `t1`, `step`, `begin`, `last` and `lands` of each lane: the end and the kind of its next step."""
     where, yes = f.select, f.const(1.0, DOUBLE, f.width)
     begin = (s.steps if module.plan.breaks else s.tried) < 0.0
     start, end, stop = s.point3_t, s.end, s.end
@@ -58,7 +58,10 @@ def aim(module: Module, f: Function, s: Lane):
 
 
 def halve(f: Function, s: Lane, t1: Value, stop: Value, otherwise: Value) -> Value:
-    """Return the end of a step: `t1`, or the middle of the time until `stop` if little of it would remain after `t1`."""
+    """Return the end of a step: `t1`, or the middle between the latest point and `stop` if `t1` is just before `stop`.
+
+    Lanes of the mask `otherwise` keep `t1`.
+    """
     short = (stop - t1 < s.h * SHORTEST_LAST) & ~otherwise
     return f.select(short, s.point3_t + (stop - s.point3_t) * 0.5, t1)
 

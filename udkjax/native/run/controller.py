@@ -1,14 +1,14 @@
-"""The step controller: whether a step is accepted, and how long the next one is.
+"""The step controller, which accepts or rejects a step, and chooses the length of the next one.
 
 Numbers of a lane `s` (layout.py has them all):
 
     point3_t, t1            time of the latest accepted state, and end of the attempted step (s)
     h                       step length chosen by the controller (s)
     error, rate             error of the attempt, relative to the tolerance; error of the previous step divided by length^order
-    begin, last, lands      one if the attempt begins a run, ends it, ends at a breakpoint
-    fallback, fallback_due  one if the fallback makes this attempt, if it must make the next
+    begin, last, lands      one if the attempt begins a run; if it ends the run; if it ends at a breakpoint
+    fallback, fallback_due  one if the fallback makes this attempt; if it must make the next one
     retries, distance       number of successive attempts shortened because of a pivot; distance from singular configurations
-    distance0 to 2          distances of the accepted states before, the latest last
+    distance0 to 2          distances of the previous accepted states, the latest last
 """
 
 from typing import Any
@@ -31,7 +31,10 @@ from udkjax.native.parts.manifold import velocity_tolerance
 
 
 def write_decide(module: Module):
-    """Accept or reject the step of lanes that are `stepping`, choose the next one, and set `until`, when outputs are due."""
+    """Write `decide(work)`: accept or reject the step of lanes that are `stepping`, and choose the next one.
+
+    It also sets `until`, the time up to which outputs are due, and the status `code` of runs that end.
+    """
     f, s = module.function("decide")
     where, yes, inf = f.select, f.const(1.0, DOUBLE, f.width), f.const(np.inf, DOUBLE, f.width)
     stepping, fallback, error, begin = s.stepping > 0.5, s.fallback > 0.5, s.error, s.begin > 0.5
@@ -90,7 +93,10 @@ def write_decide(module: Module):
 
 
 def _step_factor(module: Module, f: Function, s: Lane, accept: Value, step: Value, tries: Value | None) -> tuple[Value, Value]:
-    """Return the ratio of the next step to this one, and the error divided by (length of the step)^order."""
+    """Return the ratio of the next step to this one, of length `step`, and the error of this one divided by length^order.
+
+    `tries`: the lanes whose attempt is a trial of an implicit step; None if there are no trials.
+    """
     chosen, used = (f.variable(0.0), f.variable(0.0))
     # A trial is by another method than the step before.
     before = s.rate if tries is None else f.select(tries, f.const(np.inf, DOUBLE, f.width), s.rate)
@@ -113,7 +119,11 @@ def _factor_of_order(f: Function, before: Value, error: Value, accept: Value, st
 
 
 def _accept_step(module: Module, f: Function, s: Lane, accept: Value) -> Value:
-    """Make the end of a step the latest point; return the status of lanes whose new point ends their run, else zero."""
+    """Make the end of a step the latest point in lanes that `accept`.
+
+    Returns:
+        The `Status` with which the new point ends a run; zero in lanes that go on.
+    """
     lost = f.variable(0.0)
     with f.if_(f.any_of(accept)):
         with f.if_(f.any_of(accept & module.interpolates(f, s))):
@@ -141,7 +151,10 @@ def _accept_step(module: Module, f: Function, s: Lane, accept: Value) -> Value:
 
 
 def _due_until(module: Module, f: Function, s: Lane, accept: Value, begun: Value) -> Value:
-    """Return the time up to which outputs are due."""
+    """Return the time up to which outputs are due after an attempt; minus infinity if they have to wait for further steps.
+
+    `begun`: the lanes whose attempt was the beginning of a run.
+    """
     begin, alone = s.begin > 0.5, s.begin < -0.5
     # Outputs of the first step are interpolated after the second, unless the motion ends or changes there; by an implicit method
     # each step serves its own.
@@ -157,7 +170,9 @@ def _due_until(module: Module, f: Function, s: Lane, accept: Value, begun: Value
 
 
 def first_step(module: Module, f: Function, s: Lane) -> Value:
-    """Return the given first step, or the step over which the state changes by a hundredth of itself or of its unit.
+    """Return the length of the first step (s): `first` if it is given, else one in which the state changes by one hundredth.
+
+    The change is relative to the state or, where this is smaller, to its unit; tolerances weight the coordinates.
 
     The rule is that of `first_step` in integrate/diffrax_engine.py.
     """

@@ -7,7 +7,10 @@ from udkjax.native.module.steps import POINTS, SHORT_STEP, STRETCH
 
 
 def write_differences(module: Module, name: str = "differences", to: tuple[str, Layout] | None = None):
-    """Write Newton's divided differences of the last points, the latest first, for their states or tangents."""
+    """Write the function `name`: Newton's divided differences of the last points, the latest first, of states or tangents.
+
+    `to`: the name of a pointer to tangents, an argument of the function, with their layout; None: states, in `work`.
+    """
     pointer = to[0] if to else "work"
     f, s = module.function(name, [(POINTER, x) for x in ("work", *([pointer] if to else []))])
     inverse, used = _spacing(module, f, s)
@@ -35,11 +38,11 @@ def write_differences(module: Module, name: str = "differences", to: tuple[str, 
 
 
 def _spacing(module: Module, f: Function, s: Lane) -> tuple[dict[tuple[int, int], Value], list[Value | None]]:
-    """Return the inverse of the time between any two points, and whether the polynomial uses each point (None: always).
+    """Return the inverses of the times between any two points, and masks of the lanes in which the polynomial uses each point.
 
-    A polynomial of high degree through points that are close beside the last step would multiply rounding errors, a jump of the
-    accelerations, as between the two states at a breakpoint, and the errors of steps before in accelerations from an implicit
-    method.
+    Points have indices from the latest on; a mask None means all lanes. A point is not used if the steps before the last one are
+    much shorter than it. A polynomial of high degree through such close points would multiply rounding errors; a jump of the
+    accelerations, as between the two states at a breakpoint; and errors of accelerations from an implicit method.
     """
     times = [getattr(s, f"point{POINTS - 1 - k}_t") for k in range(POINTS)]
     step = times[0] - times[1]
@@ -58,13 +61,13 @@ def _spacing(module: Module, f: Function, s: Lane) -> tuple[dict[tuple[int, int]
 
 
 def _short_steps(module: Module, f: Function, s: Lane) -> list[tuple[Value, Value]]:
-    """Return for each step, the latest first, whether it is short, and its length."""
+    """Return for each step between points, the latest first, the mask of the lanes in which it is short, and its length (s)."""
     steps = [getattr(s, f"point{POINTS - 1 - k}_t") - getattr(s, f"point{POINTS - 2 - k}_t") for k in range(POINTS - 1)]
     return [(step * s.omega < SHORT_STEP, module.broadcast(f, step)) for step in steps]
 
 
 def write_differences_back(module: Module):
-    """Write `differences_back`: cotangents of the points from those of divided differences, which are cleared."""
+    """Write `differences_back(work)`: pull the cotangents of the divided differences back to the points, and clear them."""
     f, s = module.function("differences_back")
     active, (inverse, used), short = s.at > 0.5, _spacing(module, f, s), _short_steps(module, f, s)
     zero, count = f.const(0.0, DOUBLE, module.plan.vector), 3 * POINTS
@@ -103,7 +106,10 @@ def write_differences_back(module: Module):
 
 
 def write_between(module: Module, name: str = "between", to: tuple[str, Layout] | None = None):
-    """Write the evaluation of the polynomial at the time `next`."""
+    """Write the function `name`: evaluate the polynomial at the time `next`, as `state q` and `state v`.
+
+    `to`: as in `write_differences`, the memory of the tangents whose polynomial is evaluated; None: that of the states.
+    """
     pointer = to[0] if to else "work"
     f, s = module.function(name, [(POINTER, x) for x in ("work", *([pointer] if to else []))])
     ahead = [module.broadcast(f, s.next - getattr(s, f"point{POINTS - 1 - k}_t")) for k in range(POINTS)]
@@ -121,7 +127,7 @@ def write_between(module: Module, name: str = "between", to: tuple[str, Layout] 
 
 
 def write_outputs(module: Module):
-    """Write the states at output times up to `until`."""
+    """Write `outputs(work, call)`: project the states at all output times up to `until`, and store them in the outputs."""
     f, s = module.function("outputs", [(POINTER, "work"), (POINTER, "call")])
     inner = module.field(f, "times") - 1
 

@@ -13,7 +13,7 @@ from udkjax.native.parts.manifold import largest_violation
 
 
 def write_begin(module: Module):
-    """Write the function that loads a member into a lane."""
+    """Write `begin(work, call, lane, member)`, which loads a member into a lane."""
     write_enter(module)
     arguments = [(POINTER, "work"), (POINTER, "call"), (INT, "lane"), (INT, "member")]
     f, _ = module.function("begin", arguments)
@@ -83,7 +83,10 @@ def write_begin(module: Module):
 
 
 def _marked_rank(module: Module, f: Function, member: Value, most: Value) -> Value:
-    """Return the number of rows that a member marks as independent; no bound, which is infinite, stays."""
+    """Return the largest admissible rank of a member: the number of its rows marked as independent.
+
+    If `most`, the given bound, is infinite, there is no bound, and infinity is returned.
+    """
     numbers, marks, count = module.member_address(f, "numbers", member), module.code.marks, f.variable(0.0, width=1)
     with f.each(marks.stop, start=marks.start) as i:
         count.value = count.value + f.select(f.load(numbers, i) > 0.0, f.const(1.0), 0.0)
@@ -91,7 +94,10 @@ def _marked_rank(module: Module, f: Function, member: Value, most: Value) -> Val
 
 
 def write_finish(module: Module):
-    """Write the first and last states and the info of completed members, in lanes that are `due`."""
+    """Write `finish_members(work, call)`: store the outputs of completed members, in lanes that are `due`.
+
+    These are the first and the last state, and the output "info" (`INFO`); outputs that the run has not reached become NaN.
+    """
     f, s = module.function("finish_members", [(POINTER, "work"), (POINTER, "call")])
     times = module.field(f, "times")
     _find_cause(module, f, s)
@@ -133,7 +139,7 @@ def _write_info(module: Module, f: Function, s: Lane, k: Value):
 
 
 def _find_cause(module: Module, f: Function, s: Lane):
-    """Mark runs whose steps became too small because of a non-finite number, where they stopped or just ahead."""
+    """Set the status of stopped runs to `NOT_FINITE` if the equations are not finite where they stopped, or just ahead."""
     stopped = (
         s.due.is_(1.0)
         & s.code.is_not(float(Status.DONE))
@@ -157,7 +163,7 @@ def _find_cause(module: Module, f: Function, s: Lane):
 
 
 def kept_outputs(module: Module, f: Function, s: Lane, k: Value) -> Value:
-    """Return the number of outputs of lane k that its run has reached, up to the first lost one."""
+    """Return the number of outputs of lane k that are kept: those that its run has reached, up to the first one that is lost."""
     times = module.field(f, "times")
     is_done = f.lane(s.code, k).is_(float(Status.DONE))
     reached = f.select(is_done, f.op(f"sitofp i64 {times.name} to double", DOUBLE), f.lane(s.written, k) + 1.0)

@@ -20,7 +20,7 @@ from udkjax.pinv import Auto, Elimination, Pseudoinverse
 
 
 def formulation_code(formulation: Formulation) -> FormulationCode | None:
-    """Return the machine code of a formulation; None if it has none.
+    """Return the machine code of a formulation; None if machine code does not support it.
 
     Raises:
         UnsupportedError: a user-defined formulation uses an operation without machine code.
@@ -37,14 +37,14 @@ def formulation_code(formulation: Formulation) -> FormulationCode | None:
 
 
 class MethodCode(NamedTuple):
-    """The machine code of a method and of a formulation."""
+    """The machine code of a pseudoinverse method and of a formulation; None stands for the defaults."""
 
     pseudoinverse: DenseMethod | None  # None: elimination
     formulation: FormulationCode | None  # None: the Udwadia-Kalaba equation
 
     @classmethod
     def of(cls, method: Pseudoinverse, formulation: Formulation | None = None) -> "MethodCode":
-        """Return the machine code of a method and a formulation.
+        """Return the machine code of a pseudoinverse method and of a formulation (None: the Udwadia-Kalaba equation).
 
         Raises:
             UnsupportedError: machine code does not support one of them.
@@ -58,7 +58,10 @@ class MethodCode(NamedTuple):
 
     @staticmethod
     def formulation_settings(formulation: Any, scales: Scales) -> dict[str, Any]:
-        """Return the settings of a formulation by name: the characteristic mass (kg), its rank tolerance or its own numbers."""
+        """Return the settings of a formulation by name.
+
+        They are the characteristic mass (kg), and the rank tolerance or, for a user-defined formulation, its numbers.
+        """
         if isinstance(formulation_code(formulation), OwnFormulationCode):
             numbers = [number for x in numbers_of(formulation) for number in x.reshape(-1)]
             return {MASS: scales.mass, **dict(zip(number_names(len(numbers)), numbers, strict=True))}

@@ -9,18 +9,20 @@ from udkjax.native.module.steps import EDGE, HALVINGS, NEAR_END
 
 
 def locate_end(f: Function, lanes: Value, at_end: Value, look_at: Callable[[Value], tuple[Value, Value]]) -> Value:
-    """Locate the end of the piece in some lanes, as exactly as the next attempt needs.
+    """Locate the end of the piece within a step, in some lanes, as exactly as the next attempt needs it.
 
-    By bisection, or by false position (the Illinois variant) where the load of an edge, which is continuous, has another sign.
+    The method is bisection, or false position (the Illinois variant) where the piece ends at a zero of the load of an edge, which
+    is continuous.
 
     Args:
-        f: The function.
-        lanes: The lanes.
-        at_end: The smallest relative load of an edge at the end of the step.
-        look_at: Returns, at a fraction of the step, whether the state has left the piece, and the smallest relative load.
+        f: The function to which the search is added.
+        lanes: The mask of the lanes that search.
+        at_end: The smallest load of an edge at the end of the step, relative to the load at its start.
+        look_at: A function of a fraction of the step. It returns the mask of the lanes whose state there has left the piece, and
+            the smallest relative load of an edge there.
 
     Returns:
-        An upper bound, as a fraction of the step; one in other lanes.
+        An upper bound of the end of the piece, as a fraction of the step; one in other lanes.
     """
     low, high, side, count = f.variable(0.0), f.variable(1.0), f.variable(0.0), f.variable(0, INT, 1)
     load_low, load_high = f.variable(1.0), f.variable(at_end)
@@ -51,10 +53,11 @@ def locate_end(f: Function, lanes: Value, at_end: Value, look_at: Callable[[Valu
 
 
 def moves_by_tolerance(module: Module, f: Function, s: Lane) -> Value:
-    """Return whether the state changes by more than its tolerance in a step from the latest point to `corrected q`, `result v`.
+    """Return the lanes in which a step, from the latest point to `corrected q` and `result v`, changes the state noticeably.
 
-    At an end of a piece, derivatives of accelerations jump. What this adds to a step that begins and ends so close to it is less
-    than its error may be. A mechanism at rest there would step to and fro across the end by rounding errors for ever.
+    It does so if the state changes by more than its tolerance. At the end of a piece, derivatives of accelerations jump. The
+    effect of this jump on a step within the tolerance around the end is less than the admissible error, and is ignored. If it
+    were not, rounding errors would make a mechanism at rest there step to and fro across the end for ever.
     """
     rtol = module.broadcast(f, s.rtol)
     changes = [("point3 q", "corrected q", "scale q")]

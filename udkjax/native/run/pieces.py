@@ -25,7 +25,7 @@ from udkjax.native.run.runge_kutta import stage_state
 
 
 class StepDecision(NamedTuple):
-    """Findings about a step, as masks of lanes."""
+    """Decisions about a step that may end in another piece, each as a mask of lanes."""
 
     stepping: Value
     is_accurate: Value
@@ -36,12 +36,13 @@ class StepDecision(NamedTuple):
 
 
 def write_end_piece(module: Module):
-    """Write `end_piece`: decide in lanes of `again` whether a step that ends in another piece is accepted or repeated.
+    """Write `end_piece(work)`: decide to accept or to repeat a step that may end in another piece, in lanes that are `again`.
 
-    Such a step is repeated to end just before the end of the piece. A tiny step then crosses the end, and the run begins anew:
-    the accelerations of all points of an interpolation must belong to one piece. So must those of all stages of a step, since
-    their derivatives jump: a step that ends in its piece, but has a stage near its end in another, is repeated to end earlier.
-    Only a jump that follows from constraints may remain if states are projected, which makes their derivatives right.
+    A step that ends in another piece is repeated to end just before the end of its piece. A tiny step then crosses the end, and
+    the run begins anew: the accelerations of all points of an interpolation must belong to one piece. So must those of all stages
+    of a step, since their derivatives jump: a step that ends in its piece, but has a stage near its end in another piece, is
+    repeated to end earlier. If states are projected, a jump that follows from constraints may remain between stages: projection
+    makes the derivatives of states right.
     """
     end = _EndOfPiece(module)
     end.keep_pieces()
@@ -78,7 +79,7 @@ class _EndOfPiece:
                 self._module.put(f, f"state {x}", r, value)
 
     def _edge(self, k: Value) -> Value:
-        """Return the load of an edge where `pieces` were found last."""
+        """Return the load of edge k at the state for which `pieces` was last computed."""
         return self._module.entry(self._f, "pieces", k + self._first_edge)
 
     def _any_edge(self, meets: Callable[[Value, Value], Value]) -> Value:
@@ -91,7 +92,10 @@ class _EndOfPiece:
         return found.value
 
     def _turned(self) -> Value:
-        """Return whether the load of an edge has another sign; loads that are nearly zero before count only in a step across."""
+        """Return the lanes in which the load of an edge has another sign than at the start of the step.
+
+        A load that was nearly zero at the start is ignored, except in a step across the end of a piece.
+        """
 
         def differs(current: Value, previous: Value) -> Value:
             now, before = current > 0.0, previous > 0.0
@@ -100,7 +104,10 @@ class _EndOfPiece:
         return self._any_edge(differs)
 
     def _least_load(self) -> Value:
-        """Return the smallest load of an edge that counts, relative to that at the start of the step; infinite if none does."""
+        """Return the smallest ratio of the load of an edge to its load at the start of the step.
+
+        Edges whose loads were nearly zero at the start are ignored; the result is infinite if no edge remains.
+        """
         f, module = self._f, self._module
         inf = f.const(np.inf, DOUBLE, f.width)
         least = f.variable(inf)
@@ -111,7 +118,7 @@ class _EndOfPiece:
         return least.value
 
     def _moved(self) -> Value:
-        """Return whether the state is in another piece than the start of the step."""
+        """Return the lanes in which the state is in another piece than the start of the step."""
         f, module = self._f, self._module
         differs = f.variable(self._turned(), BOOL)
         with f.each(self._first_edge) as k:
@@ -122,7 +129,7 @@ class _EndOfPiece:
     # --- the parts of the function
 
     def keep_pieces(self):
-        """Write: keep the state at the end of the step with its edges, and the pieces of the start."""
+        """Write code that saves the positions and edge loads at the end of the step, and finds the pieces at its start."""
         f, module = self._f, self._module
         with f.each(module.rowcount) as r:
             module.put(f, "corrected q", r, module.vector(f, "state q", r))
@@ -137,7 +144,7 @@ class _EndOfPiece:
                 module.put_entry(f, "pieces before", k, module.entry(f, "pieces", k))
 
     def strays(self) -> Variable:
-        """Return the lanes in which a stage near the end of the step is in another piece."""
+        """Write code that finds the lanes in which a stage near the end of the step is in another piece; return their mask."""
         f, s, module = self._f, self._s, self._module
         strays = f.variable(f.const(False, BOOL, f.width), BOOL)
 
@@ -157,7 +164,7 @@ class _EndOfPiece:
         return strays
 
     def find_pieces_of_end(self):
-        """Write: find the pieces at the end of the step, with the edges that were kept."""
+        """Write code that finds the pieces at the end of the step; the loads of edges are those that were saved."""
         f, module = self._f, self._module
         self._go_to(self._s.t1, lambda r: (module.vector(f, "corrected q", r), module.vector(f, "result v", r)))
         if self._first_edge:
@@ -167,7 +174,10 @@ class _EndOfPiece:
                 module.put_entry(f, "pieces", k + self._first_edge, module.entry(f, "edges", k))
 
     def decide(self, strays: Variable):
-        """Write: locate the end of the piece, and decide where the next step ends."""
+        """Write code that locates the end of the piece, and decides where the next step ends.
+
+        `strays`: the lanes in which a stage near the end of the step is in another piece.
+        """
         f, s, module = self._f, self._s, self._module
         stepping, step = s.again > 0.5, s.t1 - s.point3_t
         # The polynomial of a step is no motion where its error is so large that the controller shortens it as far as it may.
@@ -192,7 +202,14 @@ class _EndOfPiece:
         self._aim(StepDecision(stepping, is_accurate, leaves, repeats, shortens, turns), aim, share, step)
 
     def _aim(self, found: StepDecision, aim: Value, share: Value, step: Value):
-        """Write: set where the next step ends, and which lanes repeat this one."""
+        """Write code that sets where the next step ends, and the lanes that repeat this one (`again`).
+
+        Args:
+            found: The decisions about this step.
+            aim: The aim of this step: `AIM_BEYOND`, `AIM_BEFORE` or `AIM_ACROSS`.
+            share: An upper bound of the end of the piece, as a fraction of this step.
+            step: The length of this step (s).
+        """
         f, s, where = self._f, self._s, self._f.select
         stepping, is_accurate, leaves, repeats, shortens, turns = found
         yes, inf = f.const(1.0, DOUBLE, f.width), f.const(np.inf, DOUBLE, f.width)

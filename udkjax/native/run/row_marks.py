@@ -5,7 +5,7 @@ Therefore the mechanism is moved by one step: along its velocity or, at rest, al
 with its drivers slightly advanced. It is closed by Newton's method, and the rows that elimination retains are marked, or those
 that it retains at the start if there are more: the step may lead to a singular position. If it does not close, or returns to the
 start, as it may at rest where two branches of its motion meet, all rows are marked: elimination then encounters small pivots, and
-the rank-revealing fallback takes every step.
+the rank-revealing fallback takes every step. A mark is one for an independent row, and zero for the others.
 """
 
 from collections.abc import Callable
@@ -70,7 +70,11 @@ class RowMarks(Module):
             self.copy_lane(f, to, 0, "marks", k, count=self.m)
 
     def _step_aside(self, f: Function, s: Lane) -> Value:
-        """Step along the velocity or a random direction, close, and compute Psi; return whether constraints leave any free."""
+        """Step along the velocity or along a random direction, close the mechanism there, and compute Psi.
+
+        Returns:
+            The mask of the lanes in which the constraints allow a motion.
+        """
         width = self.plan.width
         direction = np.random.default_rng(0).uniform(-1.0, 1.0, self.n)
         self.loops.globals.append(
@@ -94,11 +98,14 @@ class RowMarks(Module):
         return f.like(is_free, BOOL, width)
 
     def _size(self, f: Function, name: str) -> Value:
-        """Return the size of a change of coordinates, in the scene's units."""
+        """Return the largest component of the change `name` of the coordinates, in the scene's own units."""
         return self.largest(f, lambda r: [f.abs(self.vector(f, name, r)) * self.vector(f, "inverse unit", r)])
 
     def _mark_rows(self, f: Function, where: Callable[[Value], Value] | None) -> Value:
-        """Find the independent rows at the state; return their number, and keep their marks, in lanes `where` this is better."""
+        """Find the independent rows at the state, store their marks, and return their number.
+
+        `where`: a function of this number that returns the mask of the lanes in which marks are stored; None: all lanes.
+        """
         self.invoke(f, "independent_rows")
         count = f.variable(0.0)
         with f.each(self.m) as i:
@@ -110,7 +117,7 @@ class RowMarks(Module):
         return count.value
 
     def _distance(self, f: Function) -> Value:
-        """Return the distance from the initial position, in the scene's units."""
+        """Return the largest difference of a coordinate from the initial position, in the scene's own units."""
 
         def of_register(r: Value) -> list[Value]:
             moved = self.vector(f, "state q", r) - self.vector(f, "point3 q", r)

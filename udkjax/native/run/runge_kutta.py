@@ -10,9 +10,10 @@ from udkjax.native.module.tableau import Method
 
 
 def write_attempt(module: Module):
-    """Write `attempt`: a step from point 3 to `t1`, of length `step`, in lanes that are `stepping`.
+    """Write `attempt(work)`: take a step from point 3 to `t1`, of length `step`, in lanes that are `stepping`.
 
-    It computes the state at `t1` as `state q`, `result v` and `result a`, with its `error` and `distance`.
+    The state at `t1` becomes `state q`, `result v` and `result a`. `error` is the error of the step relative to its tolerance,
+    `distance` the distance from singular configurations.
     """
     module.stiffness.write_measurement()
     f, s = module.function("attempt")
@@ -91,7 +92,18 @@ def stage_state(
     method: Method | None = None,
     mask: Value | None = None,
 ):
-    """Compute the state of stage i of the step from a point, by one of the module's methods, in all or some lanes."""
+    """Compute the state of stage i of a step, as `state t`, `state q` and `state v`.
+
+    Args:
+        module: The module.
+        f: The function to which the code is added.
+        s: The numbers of its lanes.
+        i: The index of the stage; the number of stages means the end of the step.
+        start: The point from which the step starts.
+        step: The length of the step (s); None: `s.step`.
+        method: The method; None: `module.method`.
+        mask: The lanes whose `state q` and `state v` change; None: all lanes.
+    """
     step, method = s.step if step is None else step, method or module.method
     h, names = module.broadcast(f, step), list(module.stage_accelerations)
     names[0] = names[0] if start == "point3" else f"{start} a"
@@ -108,5 +120,5 @@ def stage_state(
 
 
 def error_of_velocities(module: Module) -> str:
-    """Return the name of the array of estimated errors of velocities, before their projection."""
+    """Return the name of the array that holds the estimated errors of velocities, before these errors are projected."""
     return "state dv" if module.plan.projected else "result dv"

@@ -34,16 +34,16 @@ from udkjax.native.run.runge_kutta import error_of_velocities, stage_state
 class StageEquations:
     """The functions of a module that solve stages, in lanes that are `stepping`.
 
-        take_stages_from_point3(work)    the accelerations of all stages of the step `step` from point 3
-        factor_stage(work)               the LU factors of D, from the slopes at the state
-        solve_stage(work)                `guess a` of a stage, and its state
+        take_stages_from_point3(work)    compute the accelerations of all stages of a step of length `step` from point 3
+        factor_stage(work)               factorize D, from the slopes at the state
+        solve_stage(work)                solve the equations of a stage for `guess a`, and its state
 
-    `exact`: whether there is a second matrix, at the state of each solved stage, for derivatives: by the implicit function
-    theorem those of a_i follow from D at the solution and from the slopes of a, whatever the iteration was. Its functions are
+    With `exact`, there is a second matrix D, at the state of each solved stage, for derivatives: by the implicit function theorem
+    the derivatives of a_i follow from D at the solution and from the slopes of a, whatever the iteration was. Its functions are
 
-        factor_exact(work)               its LU factors
-        solve_exact(work)                the row `x` = D^(-1) b
-        solve_exact_transposed(work)     the row `b` = D^(-T) x
+        factor_exact(work)               factorize this matrix
+        solve_exact(work)                compute the row `x` = D^(-1) b
+        solve_exact_transposed(work)     compute the row `b` = D^(-T) x
     """
 
     is_cold = False  # whether few runs need the stages, which spend their time in the functions that they call
@@ -71,7 +71,7 @@ class StageEquations:
         p.add("cleared")
 
     def _reserve(self):
-        """Reserve the memory of a subclass; nothing by default."""
+        """Hook: a subclass reserves the memory that it needs in addition. Does nothing by default."""
 
     def write(self):
         """Write all functions of the stage equations."""
@@ -89,17 +89,21 @@ class StageEquations:
             solve(DenseMatrices(self._exact, f))
 
     def _write_further(self):
-        """Write the functions of a subclass; nothing by default."""
+        """Hook: a subclass writes the functions that it has in addition. Does nothing by default."""
 
     def exact(self, f: Function) -> DenseMatrices:
-        """Return the matrix at a solved stage, in a function."""
+        """Return access, within the function f, to the second matrix, D at a solved stage."""
         assert self._exact is not None
         return DenseMatrices(self._exact, f)
 
     def _write_factor(self, name: str, layout: DenseLayout, to: str):
-        """Write the computation of D, from the slopes at the state, and of its LU factors.
+        """Write the function `name`: compute D from the slopes at the state, and its LU factors.
 
-        If D is `kept`, only lanes that are to `renew` it change; the others factorize what they had, with equal results.
+        Args:
+            name: The name of the function.
+            layout: The layout of the matrix and its factors.
+            to: The matrix that receives D. If it is "kept", only lanes that are to `renew` D change it; the other lanes factorize
+                the old matrix again, with the same result.
         """
         module = self._in
         f, s = module.function(name)
@@ -129,7 +133,11 @@ class StageEquations:
         return f.at(f.given["tangent"], self._tangent["slope a"] * self._tangent.width)
 
     def _seed(self, f: Function, first: Value, of_q: Value, of_v: Value):
-        """Set the changes of the state along directions from `first` on: those of unit accelerations of one coordinate each."""
+        """Set the tangents of the state for a group of directions, the columns of D from `first` on.
+
+        Each direction is a unit change of one acceleration of the stage: the coordinate changes by h^2 g^2 (`of_q`) and its
+        velocity by h g (`of_v`).
+        """
         tangent, lanes, count = f.given["tangent"], self._tangent.width, self._in.n
         if self._group == 1:
             for name, x in (("state q", of_q), ("state v", of_v)):
@@ -140,7 +148,10 @@ class StageEquations:
                 f.store(f.lane(x, j), tangent, self._place(name, first + j) + j)
 
     def _enter_columns(self, f: Function, d: DenseMatrices, first: Value, to: str, mask: Value | None):
-        """Enter the columns of D along directions from `first` on; those beyond the last are zero."""
+        """Store the columns of D from `first` on, as many as a group has, in the matrix `to`.
+
+        Padding after the last column becomes zero. `mask`: the lanes whose matrix changes; None: all lanes.
+        """
         tangent, n, lanes = f.given["tangent"], self._in.n, self._tangent.width
 
         def chosen(new: Value, old: Value) -> Value:
@@ -155,7 +166,10 @@ class StageEquations:
             row.put(first + j, chosen(row.entry(first + j) + 1.0, row.entry(first + j)))
 
     def _write_solve(self):
-        """Write `solve_stage(work)`: correct `guess a` with the state until they agree, in lanes that are `stepping`."""
+        """Write `solve_stage(work)`: correct `guess a` and the state of a stage until the iteration converges.
+
+        It does so in lanes that are `stepping`; lanes that do not converge become `diverged`.
+        """
         module = self._in
         f, s = module.function("solve_stage")
         diagonal, width = self._method.diagonal, f.width
@@ -196,7 +210,7 @@ class StageEquations:
         s.where(s.iterating > 0.5, diverged=1.0)
 
     def _correct(self, f: Function, d: DenseMatrices):
-        """Compute the correction x of `guess a` from `residual a`, the accelerations at its state."""
+        """Compute the row x, the correction of `guess a`, from `residual a`, the accelerations at the state of the stage."""
         module, b = self._in, d.row("b")
 
         def residual(r: Operand):
@@ -206,10 +220,16 @@ class StageEquations:
         self._lu.solve(d)
 
     def _measure_growth(self, f: Function, s: Lane):
-        """Hook: called at the beginning of a step, with its matrix."""
+        """Hook: update `s.growth`, an estimate of the largest eigenvalue of I - D. Does nothing by default.
+
+        Called in the code of `take_stages_from_point3`, after D has been factorized for the step.
+        """
 
     def write_stages(self, start: str):
-        """Write the accelerations of all stages after the first, of the step from a point."""
+        """Write `take_stages_from_<start>(work)`: compute the accelerations of all stages after the first.
+
+        `start`: the name of the point from which the step starts, such as "point3".
+        """
         module, method = self._in, self._method
         f, s = module.function(f"take_stages_from_{start}")
         f.cold = self.is_cold
@@ -251,7 +271,7 @@ class StageEquations:
 class StagesOfChosenSteps(StageEquations):
     """The stages of a module that chooses between explicit and implicit steps, with the numbers that this choice needs.
 
-        smooth_error(work)    D^(-1) of the error of velocities, where an implicit step is tried
+        smooth_error(work)    multiply the error of velocities by D^(-1), where an implicit step is tried
 
     `growth` is the magnitude of the largest eigenvalue of I - D.
     """
@@ -265,7 +285,7 @@ class StagesOfChosenSteps(StageEquations):
         self._write_smooth_error()
 
     def _measure_growth(self, f: Function, s: Lane):
-        """Take a step of the power iteration for the largest eigenvalue of I - D, from the direction found in the step before.
+        """Update `s.growth` by one step of the power iteration, from the direction `fastest` found in the step before.
 
         All sums are in the order of the columns, so that results do not depend on the number of lanes.
         """
@@ -290,7 +310,7 @@ class StagesOfChosenSteps(StageEquations):
         """Write `smooth_error(work)`: the error e of velocities becomes D^(-1) e in lanes that try an implicit step.
 
         An explicit method at its limit of stability leaves fast motions of the size of the tolerance. An implicit step damps
-        them, and their part in its first error does not show how long the next ones can be (Hairer and Wanner, IV.8).
+        them, and their part in its error does not show how long the following steps can be (Hairer and Wanner, IV.8).
         """
         module = self._in
         f, s = module.function("smooth_error")

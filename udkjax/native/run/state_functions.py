@@ -3,7 +3,7 @@
 StateAccelerations    accelerations of a state, by elimination or a dense method; by the fallback if pivots are too small
 StateReactions        multipliers of least norm, and the entries of Psi_q
 StateProjection       q and v projected onto the constraint manifold
-StateJump             the same after an event, and by how much the velocities still violate a row
+StateJump             the same after an event, and the largest remaining violation of Psi_dot
 StateTangentPart      the tangent part of small changes of q and v
 Evaluation            accelerations with multipliers, and energies, for pages
 ScaleCode             the characteristic scales (equations/terms/scale_program.py), from the numbers of a scene
@@ -57,7 +57,7 @@ class StateFunction(Trajectory):
 
     @property
     def counts(self) -> dict[str, int]:
-        """The arrays that are returned, one after another, with their sizes."""
+        """The sizes of the arrays that are returned, by name, in the order of the output."""
         return dict.fromkeys(self.found, self.n)
 
     def write_functions(self):
@@ -73,7 +73,7 @@ class StateFunction(Trajectory):
         self.write_found(f, s)
 
     def write_found(self, f: Function, s: Lane):
-        """Write the results of the members in all lanes to the output."""
+        """Store the arrays named in `counts`, of the members in all lanes, in the output "found"."""
         counts, start = self.counts, 0
         with self.each_lane(f, s.active) as k:
             to = self.result_address(f, "found", self.to_int(f, f.lane(s.member, k)), sum(counts.values()))
@@ -83,7 +83,7 @@ class StateFunction(Trajectory):
 
     @abstractmethod
     def _evaluate(self, f: Function, s: Lane):
-        """Write the evaluation of the arrays `found` at the state of each lane."""
+        """Hook: add code that computes the arrays named in `counts`, at the state of each lane (`state t`, `q` and `v`)."""
 
     def step_all(self, f: Function, s: Lane, fill):
         """Evaluate the members in all lanes, and load the next members."""
@@ -93,7 +93,7 @@ class StateFunction(Trajectory):
 
 
 class StateAccelerations(StateFunction):
-    """The accelerations of states."""
+    """The evaluation of the accelerations of states, as `result a`."""
 
     found = ("result a",)
 
@@ -122,7 +122,7 @@ class StateReactions(StateAccelerations):
 
 
 class StateProjection(StateFunction):
-    """The projection of states."""
+    """The projection of states onto the constraint manifold, as `state q` and `result v`."""
 
     closes = True
     unrolls = False
@@ -138,9 +138,9 @@ class StateProjection(StateFunction):
 
 
 class StateJump(StateProjection):
-    """The projection of states that events change, and the largest row of Psi_dot that it leaves, over the row's scale.
+    """The projection of states that events change, and the largest row of Psi_dot that remains, divided by its scale.
 
-    Psi_dot is linear in the velocities: the remaining violation is that of rows that contradict others.
+    Psi_dot is linear in the velocities, so that rows remain violated only if they contradict others.
     """
 
     @property
@@ -158,7 +158,7 @@ class StateJump(StateProjection):
 
 
 class StateTangentPart(StateFunction):
-    """The tangent part of small changes dq and dv of states, two further inputs."""
+    """The tangent part of small changes of states; the changes are two further inputs, `dq` and `dv`."""
 
     inputs = ("dq", "dv")
     found = ("result dq", "result dv")
@@ -187,12 +187,14 @@ class Evaluation:
 
     Its functions are called directly, with addresses in one block of memory:
 
-        numbers(parameters, numbers)      numbers of the scene that depend on parameters, into the vector of all numbers
-        prologue(numbers, work)           the constants of the scene from its numbers
-        accelerations(work, work)         "a", the solution "x0" of the linear system, and "friction_power" (W), of "t", "q", "v"
-        energy(work, work)                "energy", kinetic and potential (J), from "q" and "v"
+        numbers(parameters, numbers)      store the numbers of the scene that depend on parameters in the vector of all numbers
+        prologue(numbers, work)           compute the constants of the scene from its numbers
+        accelerations(work, work)         compute "a", the solution "x0" of the linear system, and "friction_power" (W), from "t",
+                                          "q" and "v"
+        energy(work, work)                compute "energy", kinetic and potential (J), from "q" and "v"
 
-    `places` are the offsets of the arrays of these names in `work`, in numbers; `work` begins with the constants.
+    The names in quotes are arrays in `work`, which begins with the constants; `places` are their offsets, in numbers. The caller
+    passes the function `numbers` as one of the `further` functions.
     """
 
     exports = ("prologue", "accelerations", "energy")
@@ -207,7 +209,7 @@ class Evaluation:
         self.places, self.size = layout.places, layout.size
 
     def text(self) -> str:
-        """LLVM's text of the whole module."""
+        """Return LLVM's text of the whole module."""
         loops = LoopWriter(1)
         at = {name: ("work", place) for name, place in self.places.items()}
         loops.write(self._code.prologue, "prologue", ("numbers", "work"), at | {"numbers": ("numbers", 0)})
@@ -220,7 +222,7 @@ class Evaluation:
 class ScaleCode(Memory):
     """The text of a module whose `run` computes the scales of members, by loops for any size of the scene.
 
-    Its functions are cold: optimization would not make them faster, but double the time of compiling.
+    Its functions are marked as cold: optimization would double the time of compiling without making them faster.
     """
 
     settings = ()
@@ -233,7 +235,7 @@ class ScaleCode(Memory):
                 self.places.add(name, size)
 
     def text(self) -> str:
-        """LLVM's text of the whole module."""
+        """Return LLVM's text of the whole module."""
         loops = self._write_loops()
         f = Function("run", [(POINTER, "call")])
         block, work = self.allocate(f, f.const(self.places.size, INT))

@@ -1,6 +1,6 @@
-"""Stiff motions: when a run goes on by an implicit method, and when it returns.
+"""Stiff motions: the change of a run to an implicit method, and its return to the explicit one.
 
-Every part but the one without implicit steps has stages that `stage_equations` solves, or measures when they are needed:
+A module has one of these parts, or `StiffnessPart` if all its steps are explicit and no run leaves it:
 
     LeavingIfStiff     explicit steps; runs leave the module (module/leaving.py) where long implicit steps may be accurate
     ImplicitSteps      all steps by an implicit method
@@ -40,7 +40,10 @@ from udkjax.native.run.stage_equations import StageEquations, StagesOfChosenStep
 
 
 def stiffness_of(module: Module, is_differentiated: bool) -> StiffnessPart:
-    """Return the part of a module that its plan asks for."""
+    """Return the part for stiff motions that the plan of a module asks for.
+
+    `is_differentiated`: True if the module computes derivatives, which need the matrix at solved stages.
+    """
     plan = module.plan
     if plan.method.is_implicit:
         return ImplicitSteps(module, plan.method, is_differentiated)
@@ -50,7 +53,7 @@ def stiffness_of(module: Module, is_differentiated: bool) -> StiffnessPart:
 
 
 class LeavingIfStiff(StiffnessPart):
-    """Explicit steps, whose speed is measured; runs leave where it exceeds the limit."""
+    """Explicit steps alone: `speed` is measured now and then, and a run leaves the module when it exceeds `LIMIT`."""
 
     pointers = leaving.GLOBALS
 
@@ -94,17 +97,20 @@ class LeavingIfStiff(StiffnessPart):
 
 
 class ImplicitSteps(StiffnessPart):
-    """Run every step by an implicit method."""
+    """Steps by an implicit method alone."""
 
     stages: type[StageEquations] = StageEquations
 
     def __init__(self, module: Module, method: Method, is_differentiated: bool):
-        """`is_differentiated`: whether derivatives need the matrix at solved stages."""
+        """`is_differentiated`: True if the module computes derivatives, which need the matrix at solved stages."""
         super().__init__(module.plan)
         self._in, self.method, self._by, self._is_differentiated = module, method, method, is_differentiated
 
     def write(self):
-        """Lay out and write the stage equations, after all else: a module without them has the same functions otherwise."""
+        """Lay out and write the stage equations.
+
+        They come after all else, so that all other functions are the same as in a module without implicit steps.
+        """
         module = self._in
         self._equations, first = self.stages(module, self._by, self._is_differentiated), len(module.functions)
         self._equations.write()
@@ -123,7 +129,7 @@ class ImplicitSteps(StiffnessPart):
         s.stepping = stepping
 
     def _take_explicit_stages(self, f: Function, s: Lane, stepping: Value, mask: Value, explicit: Callable[[], None]):
-        """Do nothing: no step is explicit."""
+        """Hook: take the explicit stages in lanes of `mask`. Does nothing here, as no step is explicit."""
 
     def _take_stages_in(self, f: Function, s: Lane, stepping: Value, mask: Value, take: Callable[[], None]):
         mask = (stepping > 0.5) & mask
@@ -157,7 +163,7 @@ class ImplicitSteps(StiffnessPart):
 
 
 class ChosenSteps(ImplicitSteps):
-    """Explicit steps, or implicit ones where stability limits the explicit ones, as long as that pays."""
+    """Explicit steps, and implicit ones where stability limits the length of explicit ones, as long as they pay."""
 
     entry = leaving.RESUME, ("call", "members")
     stages = StagesOfChosenSteps
@@ -220,7 +226,7 @@ class ChosenSteps(ImplicitSteps):
 
     @property
     def gain(self) -> float:
-        """The least ratio of the length of an implicit step to that of an explicit one at which it pays."""
+        """The ratio of the length of an implicit step to that of an explicit one above which the implicit step pays."""
         module = self._in
         slopes = module.n * (SLOPE_IN_LANES if module.plan.unrolled else SLOPE)
         return (CORRECTIONS * (self._by.stages - 1) + slopes) / module.method.stages
@@ -265,7 +271,7 @@ class ChosenSteps(ImplicitSteps):
 
 
 def _watch_speed(module: Module, f: Function, s: Lane):
-    """Set `speed` of an explicit step in attempts in which it is to be measured, otherwise zero."""
+    """Set `speed` in lanes that are due to measure it in this attempt at an explicit step; set it to zero in others."""
     is_due = (s.stepping > 0.5) & (s.tried >= s.watch)
     s.speed = f.const(0.0, DOUBLE, f.width)
     with f.if_(f.any_of(is_due)):
@@ -274,11 +280,11 @@ def _watch_speed(module: Module, f: Function, s: Lane):
 
 
 def _write_measure_speed(module: Module):
-    """Write `measure_speed`: `speed`, the length of an explicit step times the largest rate of the equations.
+    """Write `measure_speed(work)`: compute `speed`, the length of an explicit step times the largest rate of the equations.
 
     The last two stages are both at the end of the step, and their states differ by errors in which the fastest motions dominate
     (Hairer and Wanner, IV.2). With J the Jacobian of (q, v) -> (v, a), the rate is the root of |J J x| / |x| for this difference
-    x: that is right for a motion that decays as well as for one that swings, where |J x| / |x| would depend on the phase.
+    x. This holds for motions that decay and for oscillations; of the latter, |J x| / |x| would depend on the phase.
     """
     f, s = module.function("measure_speed")
     method, h, omega = module.method, module.broadcast(f, s.step), module.broadcast(f, s.omega)

@@ -44,7 +44,7 @@ from udkjax.native.run.stiffness import stiffness_of
 
 
 class Trajectory(Module):
-    """The code of whole trajectories."""
+    """A module whose `run` integrates members from their first to their last time, and stores states at all output times."""
 
     closes = True
 
@@ -78,13 +78,13 @@ class Trajectory(Module):
             enter_first_row(self, f, lane, member)
 
     def before_step(self, f: Function, s: Lane):
-        """Hook: called before each attempt at a step, after `t1` has been set."""
+        """Hook: add code before each attempt at a step, after `t1` has been set. Does nothing by default."""
 
     def after_step(self, f: Function, s: Lane):
-        """Hook: called after each attempt at a step, when `until` has been set."""
+        """Hook: add code after each attempt at a step, when `decide` has set `until`. Does nothing by default."""
 
     def after_outputs(self, f: Function, s: Lane):
-        """Hook: called after the outputs of a step, before completed members end."""
+        """Hook: add code after the outputs of a step, before completed members end. Does nothing by default."""
 
     def write_functions(self):
         self.write_programs()
@@ -104,7 +104,7 @@ class Trajectory(Module):
         self.write_derivatives()
 
     def step_all(self, f: Function, s: Lane, fill: Callable[[], None]):
-        """Take one step in all lanes, and finish completed members."""
+        """Take one step in all lanes, finish completed members, and load the next ones by `fill`."""
         work, call, width = f.given["work"], f.given["call"], self.plan.width
         yes = f.const(1.0, DOUBLE, width)
         due_for_fallback = s.fallback_due > 0.5

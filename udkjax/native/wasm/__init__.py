@@ -1,8 +1,8 @@
 """Modules of the engine as WebAssembly, for pages that simulate: the same text, compiled by the same LLVM for another target.
 
-`wasm_module` makes the module of an operation, `hosted_module` that of functions of JAX which call a page (hosted.py);
-`compile_wasm` compiles a text (target.py), and `link` converts LLVM's object code
-to a loadable module (object_code.py); no linker is needed, as modules consist of a single object.
+`wasm_module` compiles an operation, `evaluation_module` the evaluation of single states, and `hosted_module` functions of JAX
+that call functions of a page (hosted.py). `compile_wasm` compiles a text (target.py), and `link` converts LLVM's object code to a
+loadable module (object_code.py); no linker is needed, as modules consist of a single object.
 """
 
 from udkjax.native.wasm.hosted import HostedModule, hosted_module

@@ -22,20 +22,26 @@ from udkjax.native.wasm.target import compile_wasm
 
 
 class ImportedFunction(NamedTuple):
-    """A function of the host: the places of its arguments, which functions may share, and the size of its result."""
+    """A function of the host, which functions of JAX may call.
+
+    Attributes:
+        name: The name of the function, and of the place of its result.
+        arguments: The shapes of its arguments by the names of their places, which functions may share.
+        size: The number of elements of its result.
+    """
 
     name: str  # also of the place of its result
     arguments: dict[str, tuple[int, ...]]
     size: int
 
     def __call__(self, *arguments: Any) -> jax.Array:
-        """Return the result, in a function that JAX traces."""
+        """Return the result as a traced array; this is called in functions that JAX traces."""
         given = {name: x for name, x in zip(self.arguments, arguments, strict=True) if np.size(x)}
         return ModuleCall((self.name,), tuple(given), ((self.name, (self.size,)),))(*given.values())[0]
 
 
 class HostedModule(NamedTuple):
-    """A module, with the index and the shape of each array in its block of `size` numbers."""
+    """A compiled module; and, by name, the index and the shape of each array in its block of `size` numbers."""
 
     linked: LinkedModule
     places: dict[str, tuple[int, tuple[int, ...]]]
@@ -47,11 +53,11 @@ def hosted_module(
     inputs: Mapping[str, tuple[int, ...]],
     imports: Mapping[str, tuple[dict[str, tuple[int, ...]], int]],
 ) -> HostedModule:
-    """Compile functions of the same arrays.
+    """Compile functions of the same inputs to a module.
 
     Args:
-        functions: by name, functions of the host's functions by name, and of all inputs in order. They return arrays by name;
-            those with names of inputs are their new values.
+        functions: the functions by name. Each takes the functions of the host, by name, as its first argument, then all inputs in
+            order. It returns arrays by name; an array with the name of an input replaces this input.
         inputs: the shapes of the inputs.
         imports: by name, for each function of the host, the shapes of its arguments, which functions may share by their names,
             and the size of its result.

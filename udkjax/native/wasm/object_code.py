@@ -1,4 +1,4 @@
-"""Conversion of LLVM's WebAssembly object code to a loadable module, with exports and without sections for linkers.
+"""Conversion of WebAssembly object code by LLVM to a loadable module, with exports and without sections for linkers.
 
 In an object all functions have their final indices, and data begin at address 0, so nothing has to be relocated; the memory and
 the stack pointer are imports. An object has no export section: the indices of its functions are in the symbol table, in the
@@ -31,7 +31,7 @@ class LinkedModule(NamedTuple):
 
 
 class Reader:
-    """Sequential reading of numbers and names from bytes."""
+    """A reader of numbers and names from bytes, one after another; it is true as long as bytes are left."""
 
     def __init__(self, data: bytes):
         self.data, self.at = data, 0
@@ -40,7 +40,7 @@ class Reader:
         return self.at < len(self.data)
 
     def byte(self) -> int:
-        """Read one byte."""
+        """Read one byte as an integer."""
         return self.take(1)[0]
 
     def take(self, count: int) -> bytes:
@@ -67,7 +67,7 @@ class Reader:
 
 
 def leb128(value: int) -> bytes:
-    """Return a nonnegative integer in LEB128."""
+    """Return the bytes of a nonnegative integer in LEB128."""
     digits = bytearray()
     while value > 127:
         digits.append(value & 127 | 128)
@@ -76,7 +76,7 @@ def leb128(value: int) -> bytes:
 
 
 def link(code: bytes, exports: Sequence[str]) -> LinkedModule:
-    """Convert an object to a module that exports functions by name.
+    """Convert an object to a loadable module that exports the functions of some names.
 
     Raises:
         ValueError: a function is missing, or the bytes are not object code by LLVM.
@@ -124,7 +124,7 @@ def _function_numbers(sections: Sequence[tuple[int, bytes]]) -> dict[str, int]:
 
 
 def _symbol(table: Reader) -> tuple[int, str, int]:
-    """Read a symbol: its kind, its name if it is defined in this object, and its index."""
+    """Read a symbol; return its kind, its name ("" unless it is defined in this object), and its index."""
     kind, flags = table.byte(), table.number()
     defined = not flags & UNDEFINED
     if kind == DATA_SYMBOL:
@@ -165,7 +165,7 @@ def _skip_type(reader: Reader, kind: int):
 
 
 def _data_end(body: bytes) -> int:
-    """Return the end of the last data segment."""
+    """Return the end (bytes) of the last data segment in memory; 0 without data."""
     reader, end = Reader(body), 0
     for _ in range(reader.number()):
         if reader.number() or reader.byte() != I32_CONST:

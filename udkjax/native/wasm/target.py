@@ -47,7 +47,7 @@ def wasm_module(operation: Operation) -> WasmModule:
 
 
 def evaluation_module(code: RunPrograms, further: Sequence[Function]) -> tuple[LinkedModule, Evaluation]:
-    """Compile the evaluation of a scene at single states, with the function `numbers` among further ones.
+    """Compile the functions that evaluate a scene at single states, and further ones, among which is a function `numbers`.
 
     Returns:
         The module, and the evaluation, which describes its functions and its memory.
@@ -57,7 +57,7 @@ def evaluation_module(code: RunPrograms, further: Sequence[Function]) -> tuple[L
 
 
 def compile_wasm(text: str, exports: tuple[str, ...]) -> LinkedModule:
-    """Return the module of LLVM's text with some functions exported, from disk or newly compiled."""
+    """Return the WebAssembly module of LLVM's text, which exports some functions, from the cache on disk or newly compiled."""
     key = machine.digest("\0".join((TRIPLE, FEATURES, text)))
     code = code_cache.read(key)
     if code is None:

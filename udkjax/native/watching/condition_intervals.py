@@ -18,7 +18,10 @@ from udkjax.native.watching.watch_memory import WatchMemory
 
 
 def write_classification(module: WatchMemory):
-    """Write `judge(work)`: classify two intervals at their last node, in lanes where `low` is one, and act accordingly."""
+    """Write `judge(work)`: classify two intervals when their last node has been evaluated, in lanes where `low` is one.
+
+    The lanes then go on to the next intervals, seek a crossing, refine the intervals, or stop.
+    """
     f, s = module.function("judge")
     mask, length = s.low > 0.5, s.look - s.first_t
     unresolved = [f.variable(0.0), f.variable(0.0)]
@@ -56,7 +59,16 @@ def write_classification(module: WatchMemory):
 
 
 def _advance(module: WatchMemory, f: Function, s: Lane, mask: Value, unresolved: list[Variable], hits: list[Variable]):
-    """Continue after resolved intervals, locate crossings in them, and refine or stop at unresolved ones."""
+    """Go on after resolved intervals, seek crossings in them, and refine or stop at unresolved ones.
+
+    Args:
+        module: The module.
+        f: The function to which the code is added.
+        s: The numbers of its lanes.
+        mask: The lanes whose intervals have been classified.
+        unresolved: The fault of each interval: `VARIES_FAST`, `UNDEFINED`, or zero if it is resolved.
+        hits: One for each interval in which a condition crosses zero, else zero.
+    """
     one, zero = f.const(1.0, DOUBLE, f.width), f.const(0.0, DOUBLE, f.width)
     is_after_break = s.fresh > s.first_t  # the polynomial belongs to another piece of the motion
     span = s.look - s.first_t
@@ -91,7 +103,10 @@ def _advance(module: WatchMemory, f: Function, s: Lane, mask: Value, unresolved:
 
 
 def _refine(module: WatchMemory, f: Function, s: Lane, mask: Value, span: Value, k: int):
-    """Repeat two intervals with closer nodes, from the first or the middle node on."""
+    """Repeat two intervals with closer nodes in the lanes of `mask`, from their first node on (k = 0) or their middle node (1).
+
+    `span`: the length of both intervals (s).
+    """
     with f.if_(f.any_of(mask)):
         if k == 1:
             module.move_conditions(f, mask, g1="g0", rate1="rate0")
@@ -107,7 +122,11 @@ def _sign(f: Function, x: Value) -> Value:
 
 
 def _error(f: Function, g: list[Value], rate: list[Value], length: Value, x: Value) -> Value:
-    """Return the error of Hermite's cubic over two intervals, for the condition or its rate at the middle node."""
+    """Return the error of Hermite's cubic over two intervals at the middle node, of the condition or, weighted, of its rate.
+
+    `g` and `rate`: the condition and its rate at the three nodes; `length`: the length of both intervals (s); `x`: the position
+    of the middle node, as a fraction.
+    """
     a, da, b, db = g[0], rate[0] * length, g[2], rate[2] * length
     square, cube = (b - a) * 3.0 - da * 2.0 - db, (a - b) * 2.0 + da + db
     value = a + x * (da + x * (square + x * cube))
@@ -125,7 +144,10 @@ def _classify_interval(
     after: Value,
     floor: Value,
 ) -> tuple[Value, Value]:
-    """Return whether a condition changes sign in an interval, and whether this is certain, from values and rates at its ends."""
+    """Return the mask of lanes in which a condition changes sign in an interval, and the mask of those where this is certain.
+
+    `ends`: value and rate at the first node, then at the second; `before` and `after`: the sides there.
+    """
     hit = after * before < 0.0
     side = f.select(before.is_(0.0), after, before)
     single, away = RESOLUTION.classify_interval(f, ends, step, error, side, floor)

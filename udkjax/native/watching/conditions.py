@@ -1,4 +1,4 @@
-"""Conditions that a run watches (watching.py): their programs and inputs, and the resolution in time."""
+"""The conditions that a run watches (watching.py): their programs and inputs, and their resolution in time."""
 
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, field
@@ -17,14 +17,14 @@ class Resolution(NamedTuple):
         resolved: largest error of the cubic, as a fraction of the change of a condition in an interval; an interval with a larger
             error is too coarse. A resolved oscillation has at least 7 intervals in a period, and no interval with two zeros; a
             smaller fraction needs more windows for the same events.
-        miss: error in one interval, as a fraction of the error over two intervals. In fine intervals it is 1/16, by the fourth
-            power of the length; four times as much is safe in coarser intervals. With rates by differences, the full error
-            counts.
+        miss: error in one interval, as a fraction of the error over two intervals. In fine intervals the fraction is 1/16, since
+            the error grows with the fourth power of the length; four times as much is safe in coarser intervals. With rates by
+            differences, the full error counts.
         far: distance from zero, in errors, beyond which a condition has no zero even in an interval that is too coarse: so
             large a change would be resolved.
         finer: factor by which an interval that is too coarse is refined.
         short: length of a window, in T, in which an unresolved condition has a jump or a kink, or varies throughout.
-        finest: length of a window, in T, in which changes are no longer resolved.
+        finest: length of a window, in T, that is not refined further, so that changes within it are not resolved.
         late: largest error of the time of a located event, in T; the error of a Taylor step of this length, its square, is
             rounding.
     """
@@ -41,15 +41,15 @@ class Resolution(NamedTuple):
     def classify_interval(
         self, arithmetic: Any, ends: Sequence[Any], step: Any, error: Any, side: Any, floor: Any
     ) -> tuple[Any, Any]:
-        """Classify an interval between two nodes: whether a condition crosses zero in it once for certain, or never for certain.
+        """Classify an interval between two nodes: a condition certainly crosses zero in it once, certainly never, or neither.
 
         The condition is Hermite's cubic up to E x^2 (1 - x)^2, with 0 <= x <= 1. It crosses zero once if the Bernstein
         coefficients of degree 4 of the cubic, plus and minus this bound, change sign once (Descartes' rule), and never if they do
-        not change sign; at the first node, if the condition is beyond zero from there on. The same code serves lanes of machine
-        code and arrays of JAX.
+        not change sign. A condition that is far beyond zero in the whole interval has crossed zero once, at the first node. The
+        same code serves lanes of machine code and arrays of JAX.
 
         Args:
-            arithmetic: `min` and `max` of two values; a `Function` has them.
+            arithmetic: an object with functions `min` and `max` of two values, such as a `Function`.
             ends: value and rate at the first node, and at the second.
             step: length of the interval (s).
             error: E.
@@ -57,7 +57,7 @@ class Resolution(NamedTuple):
             floor: distance from zero below which a condition counts as zero.
 
         Returns:
-            Two masks.
+            The mask of intervals with certainly one crossing, and the mask of those with certainly none.
         """
         a, b = ends[0] * side, ends[2] * side
         inner_start, inner_end = a + ends[1] * side * step * (1 / 3), b - ends[3] * side * step * (1 / 3)
@@ -110,7 +110,7 @@ FORCE_STEP = 1e-7  # time difference, in T, for the rate of a force
 
 @dataclass(frozen=True)
 class Conditions:
-    """Conditions g(t, q, v), and forces of constraints, that a run watches; compared by texts instead of programs.
+    """The conditions g(t, q, v) and the forces of constraints that a run watches; they are equal if their texts are equal.
 
     Attributes:
         key: texts of the programs.
@@ -136,7 +136,7 @@ class Conditions:
 
     @property
     def own_count(self) -> int:
-        """The number of conditions that are programs."""
+        """The number of conditions g, without the watched forces."""
         return len(self.program.outputs) // 2
 
     @property
@@ -146,9 +146,9 @@ class Conditions:
 
     @property
     def count(self) -> int:
-        """The number of watched conditions and forces."""
+        """The number of conditions g and watched forces; the forces come last."""
         return self.own_count + self.force_count
 
     def output_count(self, n: int) -> int:
-        """Return the number of values that a run with n coordinates returns about its end."""
+        """Return the length of the output "crossing" of a run with n coordinates: `head`, the sides, q and v at its end."""
         return self.head + self.count + 2 * n

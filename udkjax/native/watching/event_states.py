@@ -25,7 +25,7 @@ from udkjax.native.watching.watched_forces import write_forces
 class EventStates(StateTangentPart, StateAccelerations):
     """The text of a module that evaluates conditions and directions of impulses at states.
 
-    Its further input holds the numbers of the conditions, and the inverse mass of each coordinate.
+    The further input `event_numbers` holds the numbers of the conditions, then the inverse mass of each coordinate.
     """
 
     inputs = ("event_numbers",)

@@ -12,12 +12,15 @@ from udkjax.native.watching.watch_memory import WatchMemory
 
 
 def write_locate(module: WatchMemory):
-    """Write `locate(work)`: find the crossing between `low` and `high`, in lanes that seek one."""
+    """Write `locate(work)`: find the first crossing between the times `low` and `high`, in lanes that seek one.
+
+    These lanes then stop at the crossing, or request a step that ends there (`landing`).
+    """
     f, s = module.function("locate")
     work, one, zero = f.given["work"], f.const(1.0, DOUBLE, f.width), f.const(0.0, DOUBLE, f.width)
 
     def crossed() -> Value:
-        """Return the first condition beyond zero, or -1."""
+        """Return the index of the first condition that is beyond zero at `look`; -1 if there is none."""
         event_index = f.variable(-1.0)
         with f.each(module.conditions.count) as c:
             beyond = (module.condition(f, "hit", c) * module.condition(f, "g", c) > 0.0) & (event_index.value < 0.0)
@@ -30,7 +33,7 @@ def write_locate(module: WatchMemory):
         return f.any_of(s.due > 0.5)
 
     def zero_ahead() -> Value:
-        """Return the first zero of the linear approximations at `look`; infinite without any."""
+        """Return the earliest zero (s) of the conditions, linearized at `look`; infinite if there is none."""
         first, inf = f.variable(float("inf")), f.const(float("inf"), DOUBLE, f.width)
         with f.each(module.conditions.count) as c:
             rate = module.condition(f, "rate", c)
@@ -40,7 +43,7 @@ def write_locate(module: WatchMemory):
         return first.value
 
     def hit_forces() -> Value:
-        """Return the number of forces that cross zero."""
+        """Return the number of watched forces that cross zero in the interval."""
         count = f.variable(0.0)
         with f.each(module.conditions.count, module.conditions.own_count) as c:
             count.value = count.value + f.abs(module.condition(f, "hit", c))
@@ -96,9 +99,9 @@ def write_approach(module: WatchMemory):
 def write_land(module: WatchMemory):
     """Write `land(work)`: end or correct the landing of lanes whose step has ended at its target.
 
-    Where the condition does not reach zero at the ends of such steps either, the crossing was an error of the polynomial, for
-    instance after a fast decay that an implicit step has passed in one step: then the run goes on from there. Where another
-    condition has crossed zero before, which may be an error of the polynomial, too, its crossing is the event.
+    If the condition does not reach zero at the end of such a step, even after corrections, its crossing was an error of the
+    polynomial, for instance after a fast decay within one implicit step: then the run goes on from there. If another condition
+    has crossed zero before, which the polynomial may have missed, its crossing is the event.
     """
     f, s = module.function("land")
     arrived = (s.landing > WANTED + 0.5) & (s.point3_t >= s.target) & s.code.is_(float(Status.RUNNING))
@@ -132,7 +135,10 @@ def write_land(module: WatchMemory):
 
 
 def _earliest(module: WatchMemory, f: Function, s: Lane) -> Value:
-    """Return the condition that crosses zero first: that of the event, or one that is beyond zero."""
+    """Return the index of the condition that crosses zero first: that of the event, or another one that is beyond zero.
+
+    The zeros are those of the conditions linearized at the end of the step.
+    """
     event, first = f.variable(-1.0), f.variable(float("inf"))
     with f.each(module.conditions.count) as c:
         g, rate, side, on, floor, direction = (

@@ -1,4 +1,4 @@
-"""The events that a run passes by itself: the numbers that they change, and the layout of their record."""
+"""The events that a run passes: the numbers that they change, and the layout of their record."""
 
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
@@ -9,7 +9,7 @@ from udkjax.native.module.layout import Layout
 
 @dataclass(frozen=True)
 class Turning:
-    """The kinks that a run passes: those of its conditions from `first` on."""
+    """The kinks that a run passes; their conditions have the indices from `first` on."""
 
     first: int
     turns: tuple[tuple[int, float, float], ...]  # of each kink: its side, which becomes `factor` times itself plus `shift`
@@ -20,24 +20,24 @@ class Turning:
 
     @property
     def sides(self) -> range:
-        """Indices of the sides of kinks among all sides."""
+        """The indices of the sides of kinks among all sides."""
         first = min(first for _, _, first in self.renewals)
         return range(first, first + sum(smooth.count for smooth, _, _ in self.renewals))
 
     def lay_out(self, places: Layout):
-        """Reserve memory."""
+        """Reserve the memory of kinks in the layout of a module."""
         places.add("renewed sides", self.sides.stop)
 
 
 @dataclass(frozen=True)
 class SlideLock:
-    """The lock that holds a joint at rest, as a program of the numbers that depend on q."""
+    """The lock that holds a joint at rest: a program that computes those of its numbers that depend on q."""
 
     key: str  # text of the program
     program: ScalarProgram = field(compare=False)  # its numbers that depend on q, from q and its constant numbers
 
     def constants(self, n: int) -> int:
-        """Return the number of constant numbers."""
+        """Return the number of constants of the lock: the inputs of its program other than the n coordinates."""
         return len(self.program.inputs) - n
 
 
@@ -45,9 +45,10 @@ class SlideLock:
 class Sliding:
     """The joints with set-valued friction whose events a run passes.
 
-    Joint j has the sides 2 j, its direction of sliding, and 2 j + 1, zero except for joints that others keep at rest. Its speed
-    forwards is the condition `first` + 2 j, and its force, how far it is from its limit in this direction, is the watched force
-    `first_force` + 2 j; those of the other direction follow.
+    Joint j has two sides: side 2 j is its direction of sliding, 1, -1, or 0 if it sticks; side 2 j + 1 is zero except for joints
+    that others keep at rest. The condition with index `first` + 2 j is its speed in the forward direction, and the watched force
+    with index `first_force` + 2 j the distance of its force from the limit in this direction. The indices plus one belong to the
+    backward direction.
     """
 
     count: int
@@ -62,16 +63,20 @@ class Sliding:
 
     @property
     def most_pivots(self) -> int:
-        """The largest number of pivots."""
+        """The largest number of pivots at one event: rounds in which joints that violate the law change their modes."""
         return (self.block_steps + self.single_steps) * self.count + 8
 
     @property
     def lock_count(self) -> int:
-        """The number of numbers of the locks: of each, whether it is on, and the mark of its row; then those that depend on q."""
+        """The length of the array `locks`.
+
+        It holds one for each lock that is on, else zero; then the mark of the row of each lock; then their numbers that depend
+        on q.
+        """
         return 2 * len(self.locks) + sum(len(x.program.outputs) for x in self.locks)
 
     def lay_out(self, places: Layout, n: int):
-        """Reserve memory."""
+        """Reserve the memory of joints that slide in the layout of a module with n coordinates."""
         places.add("lock constants", sum(x.constants(n) for x in self.locks))
         places.add("new locks", self.lock_count)
         places.add("joints at rest", self.count)
@@ -80,7 +85,7 @@ class Sliding:
 
 @dataclass(frozen=True)
 class Passing:
-    """The events that a run passes."""
+    """The events that a run passes: kinks, and joints with set-valued friction that stop or slip; None: these end the run."""
 
     kinks: Turning | None
     slides: Sliding | None
@@ -92,22 +97,22 @@ class Passing:
 
     @property
     def locks(self) -> int:
-        """The number of numbers of the locks of joints that stick."""
+        """The length of the array `locks`; 0 if the run passes no slides."""
         return self.slides.lock_count if self.slides else 0
 
     def constants(self, n: int) -> int:
-        """Return the number of constant numbers of the locks."""
+        """Return the number of constants of all locks, for n coordinates."""
         return sum(x.constants(n) for x in self.slides.locks) if self.slides else 0
 
     @property
     def joints(self) -> int:
-        """The number of joints that have locks."""
+        """The number of joints with locks."""
         return len(self.slides.locks) if self.slides else 0
 
     def row_length(self, n: int) -> int:
-        """Return the length of the record of an event: its condition and time, q, v before and after, sides, locked joints."""
+        """Return the length of the record of one event: condition, time, q, v before and v after, sides, and locked joints."""
         return 2 + 3 * n + self.sides + self.joints
 
     def record_length(self, n: int) -> int:
-        """Return the length of the record of a run: the number of events, the last numbers of the locks, a row for each event."""
+        """Return the length of the record of a run: the number of events, the last numbers of the locks, and a row per event."""
         return 1 + self.locks + self.most * self.row_length(n)

@@ -1,9 +1,9 @@
-"""Events that a run passes by itself: it records them, changes its numbers, and begins anew.
+"""Events that a run passes: it records them, changes its numbers, and begins anew.
 
 Kinks of forces change neither the state nor the constraints (turning.py). Where a joint with set-valued friction stops or slips,
 the modes that are possible are tried in turn (sliding.py). A run that has ended at such an event begins anew from there as at its
 start, unless another condition is zero, too, the decision is not clear, or the record is full: then it ends, and the loop of
-events goes on.
+events in Python (`udkjax.integrate`) takes over.
 """
 
 from typing import Any
@@ -21,13 +21,13 @@ ARRAYS = ("sides", "locks", "condition numbers", "condition side", "condition fl
 
 
 class PassingRuns(Trajectory):
-    """The part of runs that passes events; `passing` is None for runs that pass none."""
+    """The base of runs that watch conditions: the code that passes events; `passing` is None for runs that pass none."""
 
     passing: Passing | None
     conditions: Any
 
     def ask_for_forces(self, f: Function, lane: Value):
-        """Let conditions be evaluated with forces if one counts in a lane."""
+        """Set `holds` of a lane to its number of watched forces: unless it is zero, conditions are evaluated with forces."""
         count = f.variable(0.0, width=1)
         with f.each(self.conditions.count, self.conditions.own_count) as c:
             count.value = count.value + self.lane_entry(f, "condition on", lane, c)
@@ -52,7 +52,7 @@ class PassingRuns(Trajectory):
             self.places.add("numbers", -(-self.code.number_count // self.plan.width))
 
     def places_of(self, name: str) -> int:
-        """Return the length of one of `ARRAYS`."""
+        """Return the length of the array `name`, one of `ARRAYS`."""
         assert self.passing is not None
         own = {"sides": self.passing.sides, "locks": self.passing.locks, "condition numbers": self.conditions.number_count}
         return own.get(name, self.conditions.count)
@@ -88,7 +88,10 @@ class PassingRuns(Trajectory):
         self.put_lane_entry(f, "room", lane, room)
 
     def end_record(self, f: Function, k: Value, member: Value):
-        """Write the number of events of the member in lane k and its locks, and complete its counts."""
+        """Write the number of events of the member in lane k and its locks to the output "passed".
+
+        The counts in the output "info" are completed by those before the last event.
+        """
         assert self.passing is not None
         record = self.result_address(f, "passed", member, self._record_length)
         f.store(self.lane_entry(f, "turned", k), record, 0)
@@ -107,7 +110,7 @@ class PassingRuns(Trajectory):
         self._enter(f, lane, member)
 
     def _enter(self, f: Function, lane: Value, member: Value):
-        """Compute the constants of a lane for its `start`."""
+        """Compute the constants of a lane, with the samples that are valid at its time `start`."""
         if self.plan.breaks:
             enter_first_row(self, f, lane, member)
         else:
@@ -118,20 +121,26 @@ class PassingRuns(Trajectory):
         return (s.active > 0.5) & s.code.is_(float(Status.CROSSED)) & (s.turned < s.room)
 
     def look_at_event(self, f: Function, s: Lane, v: str = "sure v", conditions: str = "conditions"):
-        """Evaluate the conditions at the event, all or those of a function."""
+        """Evaluate conditions at the event: at `sure_t`, `sure q` and the velocities in the array `v`.
+
+        `conditions`: the function of the module that evaluates them.
+        """
         setattr(s, "state t", s.sure_t)
         self.copy(f, "sure q", "state q")
         self.copy(f, v, "result v")
         f.call(conditions, f.given["work"])
 
     def floor_of(self, f: Function, s: Lane, c: Value) -> Value:
-        """Return the distance from zero below which a condition is zero; its scale is at least its change in a unit of time."""
+        """Return the magnitude below which condition c counts as zero: its `floor` or, if larger, `zero` times its scale.
+
+        The scale is the change of the condition in the scene's unit of time.
+        """
         assert self.passing is not None
         rate, floor = (self.entry(f, f"condition {name}", c) for name in ("rate", "floor"))
         return f.max(f.abs(rate) * self.passing.zero / s.omega, floor)
 
     def any_condition(self, f: Function, wanted: Any) -> Value:
-        """Return the lanes in which a condition that counts is `wanted(c, g, side, floor)`."""
+        """Return the lanes in which `wanted(c, g, side, floor)` is true for at least one of the conditions that are watched."""
         s, found = Lane(f, self.places), f.variable(f.const(False, BOOL, f.width), BOOL)
         with f.each(self.conditions.count) as c:
             on, side, g = (self.entry(f, f"condition {x}", c) for x in ("on", "side", "g"))
@@ -139,12 +148,15 @@ class PassingRuns(Trajectory):
         return found.value
 
     def begin_anew(self, f: Function, s: Lane, passes: Value):
-        """Record the events of lanes, and begin these anew with their numbers of now and the velocities `after v`."""
+        """Record the events of the lanes in `passes`, and begin their runs anew there.
+
+        Sides, locks and conditions are those of the lane, velocities are `after v`.
+        """
         with self.each_lane(f, passes) as k:
             self._begin_anew(f, k, self._note(f, s, k))
 
     def _note(self, f: Function, s: Lane, k: Value) -> Value:
-        """Note the event of lane k; return the address of its record."""
+        """Append the event of lane k to the record of its member; return the address of its row in the record."""
         assert self.passing is not None
         record = self.result_address(f, "passed", self.to_int(f, f.lane(s.member, k)), self._record_length)
         start = self.to_int(f, f.lane(s.turned, k)) * self.passing.row_length(self.n)
@@ -161,7 +173,7 @@ class PassingRuns(Trajectory):
         return row
 
     def _begin_anew(self, f: Function, k: Value, row: Value):
-        """Begin the member of lane k anew at an event with this record."""
+        """Begin the run of lane k anew at the event with this row of its record."""
         n = self.n
         t, member = f.load(row, 1), self.to_int(f, self.lane_entry(f, "member", k))
         written = f.variable(self.lane_entry(f, "written", k), DOUBLE, 1)

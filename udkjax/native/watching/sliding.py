@@ -1,12 +1,13 @@
 """Joints with set-valued friction that stop, stick or slip while a run goes on.
 
-The modes of the joints follow by the pivots of complementarity/stick_or_slip.py: the equations of motion are solved in given
-modes; a joint that sticks with a force beyond its limit slides next, one that accelerates against its direction sticks again.
+The mode of a joint is to slide in a direction or to stick. The modes follow by the pivots of complementarity/stick_or_slip.py:
+the equations of motion are solved in given modes; then a joint that sticks with a force beyond its limit changes to sliding, and
+one that accelerates against its direction of sliding sticks again.
 Where joints stop together, as in a linkage with one degree of freedom that swings back, where a lock would depend on other rows,
 and in the mechanism of the scene, which lacks the locks, joints that stop can only all turn round, or go on as they slid.
 
-All other decisions are left to the loop of events: where joints stick that stopped together or depend on each other, where both
-directions obey the law of friction, and where pivots do not end.
+All other decisions are left to the loop of events in Python: where joints stick that stopped together or depend on each other,
+where both directions obey the law of friction, and where pivots do not end.
 """
 
 from collections.abc import Callable
@@ -38,7 +39,10 @@ def _is_among(event: Value, first: int, count: int) -> Value:
 
 
 def _write_locks(module: PassingRuns, slides: Sliding):
-    """Write `lock<j>(work)`: the numbers of the lock of joint j at `state q` that depend on it, among the `new locks`."""
+    """Write `lock<j>(work)` for each joint j: compute those numbers of its lock that depend on q, at `state q`.
+
+    They are stored in the array `new locks`.
+    """
     p, constants, place = module.places, 0, 2 * len(slides.locks)
     for j, lock in enumerate(slides.locks):
         count = lock.constants(module.n)
@@ -58,7 +62,11 @@ class _Modes:
         self._zero, self._one = (f.const(x, DOUBLE, f.width) for x in (0.0, 1.0))
 
     def pass_events(self, stops: Value, leaves: Value, sign: Value):
-        """Pass the events of lanes in which the joint of the event `stops`, or `leaves` its lock in the direction `sign`."""
+        """Pass the events of lanes in which the decision about the modes is clear.
+
+        `stops`: the lanes in which the joint of the event stops; `leaves`: those in which it leaves its lock, in the direction
+        `sign`.
+        """
         f, s, module = self._f, self._s, self._module
         self._look("sure v")
         # The forces of joints are compared with their limits below; only those of contacts are among the other conditions.
@@ -81,7 +89,10 @@ class _Modes:
         module.begin_anew(f, s, passes)
 
     def _choose(self, stops: Value, leaves: Value, sign: Value) -> Value:
-        """Choose the modes and `after v`; return the lanes in which they obey the law of friction."""
+        """Hook: choose the modes and `after v`; return the lanes in which they obey the law of friction.
+
+        The arguments are those of `pass_events`.
+        """
         raise NotImplementedError
 
     # --- numbers and conditions
@@ -107,7 +118,7 @@ class _Modes:
             self._f.call("enter", self._f.given["work"], self._f.given["call"], k)
 
     def _is_of_joint(self, c: Value) -> Value:
-        """Return whether a condition belongs to a joint that may stick."""
+        """Return a mask that is true in all lanes if condition c belongs to a joint that may stick, else in none."""
         f, slides = self._f, self._slides
         found = (c >= slides.first) & (c < slides.first + 2 * slides.count)
         if slides.locks:
@@ -116,9 +127,10 @@ class _Modes:
         return f.like(found, BOOL, f.width)
 
     def _is_beside_others(self, leaves: Value) -> Value:
-        """Mark the joints that stop; return the lanes in which another condition is zero, or others keep a joint at rest.
+        """Mark the joints that stop, and return the lanes in which the run cannot pass the event.
 
-        `leaves`: the lanes in which a joint leaves its lock, and no other may stop.
+        They are the lanes in which a condition of no joint is zero, too, or a joint is kept at rest by others; and those of the
+        lanes `leaves`, where a joint leaves its lock, in which a joint stops as well.
         """
         f, s, module, slides = self._f, self._s, self._module, self._slides
         is_near = module.any_condition(f, lambda c, g, _, floor: ~(f.abs(g) > floor) & ~self._is_of_joint(c))
@@ -138,11 +150,11 @@ class _Modes:
         return found.value
 
     def _others_are_beyond(self) -> Value:
-        """Return the lanes in which another condition is not clearly on its side."""
+        """Return the lanes in which a condition of no joint is not clearly on its side."""
         return self._module.any_condition(self._f, lambda c, g, side, floor: ~(g * side > floor) & ~self._is_of_joint(c))
 
     def _watch(self, mask: Value):
-        """Watch the conditions of the joints in their modes."""
+        """Let the lanes of `mask` watch the speeds of joints that slide, and the forces of those that stick."""
         slides, zero, one = self._slides, self._zero, self._one
         f = self._f
 
@@ -163,7 +175,7 @@ class _Modes:
     # --- the equations of motion
 
     def _look(self, v: str):
-        """Compute the accelerations at the event, for the conditions and the law of friction."""
+        """Compute the accelerations at the event with the velocities in the array `v`; conditions take them as `node a`."""
         f, s, module = self._f, self._s, self._module
         setattr(s, "state t", s.sure_t)
         module.copy(f, "sure q", "state q")
@@ -193,13 +205,13 @@ class _Modes:
         return self._entry("condition rate", j * 2 + self._slides.first)
 
     def _find_forces(self):
-        """Compute how far the forces of joints are from their limits; nothing without locks."""
+        """Compute the distances of the forces of joints from their limits (array `forces`), if joints have locks."""
         if self._slides.locks:
             self._module.invoke(self._f, "multipliers_of_settled")
             self._f.call("own_forces", self._f.given["work"])
 
     def _slips(self, j: Value) -> tuple[Value, Value]:
-        """Return the lanes in which joint j is locked with a force beyond its limit, and whether this is the limit forwards."""
+        """Return the lanes in which joint j is locked with a force beyond a limit, and those where it is the forward limit."""
         f = self._f
         ahead, back = (self._entry("forces", j * 2 + (self._slides.first_force + k)) for k in range(2))
         least = f.max(f.abs(ahead), f.abs(back)) * -self._slides.still
@@ -208,7 +220,10 @@ class _Modes:
     # --- directions of sliding
 
     def _set_mode(self, j: Value, direction: Value, mask: Value):
-        """Let a joint slide in a direction, or stick if this is zero; a lock that is on is independent of all other rows."""
+        """Let joint j slide in a direction, or stick if this is zero, in the lanes of `mask`.
+
+        The row of a lock that is on is marked as independent of all other rows.
+        """
         f = self._f
         self._put("sides", j * 2, direction, mask)
         if self._slides.locks:
@@ -217,7 +232,11 @@ class _Modes:
                 self._put("locks", j + k * self._slides.count, sticks, mask)
 
     def _turn(self, mask: Value) -> Value:
-        """Let all joints that stop turn round, or all go on; return the lanes in which just one of both obeys the law."""
+        """Let all joints that stop turn round, or all go on as they slid.
+
+        Returns:
+            The lanes in which exactly one of these two choices obeys the law of friction.
+        """
         f = self._f
         turns = self._try(-self._one, mask)
         goes_on = self._try(self._one, mask & ~turns)
@@ -228,7 +247,7 @@ class _Modes:
         return found
 
     def _slide(self, direction: Value, mask: Value):
-        """Let all joints that stop slide on (1) or back (-1), and compute the constants."""
+        """Let all joints that stop slide on (1) or back (-1) in the lanes of `mask`, and compute their constants."""
 
         def put(j: Value, _: Value):
             stops = self._entry("joints that stop", j) > 0.5
@@ -299,7 +318,7 @@ class _Choice(_Modes):
         return count.value > 1.5
 
     def _pivot_modes(self, stops: Value, leaves: Value, sign: Value) -> Value:
-        """Choose the modes by pivots; return the lanes in which they obey the law."""
+        """Choose the modes of joints by pivots; return the lanes in which the modes obey the law of friction."""
         f, slides = self._f, self._slides
         open_ = f.variable(stops | leaves, BOOL)
         found, step = f.variable(f.const(False, BOOL, f.width), BOOL), f.variable(0, INT, 1)
@@ -323,7 +342,11 @@ class _Choice(_Modes):
         return found.value
 
     def _pivot(self, mask: Value, largest: Value, step: Value) -> Value:
-        """Change the modes of joints that violate the law; return the lanes in which one does."""
+        """Change the modes of joints that violate the law of friction; return the lanes in which one of them violated it.
+
+        `largest`: the largest acceleration of a joint; `step`: the number of pivots before. After too many of them, only the
+        first such joint changes its mode.
+        """
         f, slides = self._f, self._slides
         found = f.variable(f.const(False, BOOL, f.width), BOOL)
         single = f.like(step >= slides.block_steps * slides.count, BOOL, f.width)
@@ -357,7 +380,7 @@ class _Choice(_Modes):
         return found.value > 0.5
 
     def _project(self, mask: Value):
-        """Set `after v` to the velocities that the new locks allow."""
+        """Set `after v` to the velocities after projection onto the constraints, including the new locks, in lanes of `mask`."""
         f, s, module = self._f, self._s, self._module
         setattr(s, "state t", s.sure_t)
         module.copy(f, "sure q", "state q")

@@ -33,9 +33,10 @@ def write_turn(module: PassingRuns, kinks: Turning):
 
 
 def _is_beside_others(module: PassingRuns, f: Function, s: Lane, turned: bool) -> Value:
-    """Return the lanes in which another condition is zero, or beyond it.
+    """Return the lanes in which a condition does not allow the run to pass the event.
 
-    Once sides have `turned`, it may be zero if it leaves zero: a step of a staircase begins where the one before ends.
+    Before the sides have `turned`, no other condition may be zero. Afterwards no condition may be beyond zero; that of the event
+    may be zero, and another one, too, if it moves to its side: a step of a staircase begins where the one before ends.
     """
 
     def is_near(c: Value, g: Value, side: Value, floor: Value) -> Value:
@@ -50,7 +51,7 @@ def _is_beside_others(module: PassingRuns, f: Function, s: Lane, turned: bool) -
 
 
 def _turn(module: PassingRuns, kinks: Turning, f: Function, s: Lane, passes: Value):
-    """Turn the sides of the kinks at which lanes are."""
+    """Turn the side of the kink at which the run of a lane has ended, in the lanes of `passes`, and renew all sides of kinks."""
     for j, (side, factor, shift) in enumerate(kinks.turns):
         before, here = module.entry(f, "sides", side), passes & s.event.is_(float(kinks.first + j))
         module.put_entry(f, "sides", side, f.select(here, before * factor + shift, before))

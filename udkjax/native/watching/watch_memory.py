@@ -119,7 +119,10 @@ class WatchMemory(PassingRuns):
             self.copy(f, source, f"{to} {x}", mask)
 
     def move_point(self, f: Function, mask: Value, k: int, ahead: Value, to: tuple[str, str] = ("state q", "state v")):
-        """Compute the state a time `ahead` of point k, by a Taylor step; its error is rounding up to `LAST_CHANGE`."""
+        """Compute the state at a time `ahead` (s) after point k, by a Taylor step; its error is rounding up to `LAST_CHANGE`.
+
+        The state becomes the arrays `to`, in the lanes of `mask`.
+        """
         ahead = self.broadcast(f, ahead)
         with f.each(self.rowcount) as r:
             q, v, a = (self.vector(f, f"point{k} {x}", r) for x in "qva")
@@ -128,13 +131,13 @@ class WatchMemory(PassingRuns):
                 self.put(f, name, r, f.select(mask, new, self.vector(f, name, r)))
 
     def stop(self, f: Function, s: Lane):
-        """End the runs of lanes that stop."""
+        """End the runs of lanes that are to stop (`stops`): as `CROSSED` if there is an event, else as `UNRESOLVED`."""
         stops = s.stops > 0.5
         s.where(stops, code=f.select(s.event >= 0.0, f.const(float(Status.CROSSED), DOUBLE, f.width), float(Status.UNRESOLVED)))
         s.where(stops, until=f.min(s.until, s.sure_t), stops=0.0, landing=0.0)
 
     def begin_intervals(self, f: Function, s: Lane, mask: Value):
-        """Begin two intervals at the node that was evaluated last."""
+        """Begin two intervals at the node that was evaluated last, in the lanes of `mask`."""
         self.move_conditions(f, mask, g="g0", rate="rate0")
         fastest = self.largest(f, lambda r: [f.abs(self.vector(f, "result v", r)) * self.vector(f, "inverse unit", r)])
         start, rest = s.look, s.end - s.look

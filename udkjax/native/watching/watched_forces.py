@@ -7,12 +7,12 @@ from udkjax.native.watching.conditions import Conditions
 
 
 def write_forces(conditions: Conditions, module: Trajectory, numbers: str = "condition numbers") -> Function:
-    """Return `own_forces(work)`, which computes the array `forces` from `multipliers` and `numbers`.
+    """Return the function `own_forces(work)`, which computes the array `forces` from the arrays `multipliers` and `numbers`.
 
     Args:
         conditions: the conditions, with forces.
         module: the module, whose memory has these arrays.
-        numbers: the array of the numbers of the conditions.
+        numbers: the name of the array that holds the numbers of the conditions.
     """
     assert conditions.forces is not None  # checked by the caller
     p = module.places

@@ -24,7 +24,7 @@ from udkjax.native.watching.watched_forces import write_forces
 
 
 class Watching(WatchMemory):
-    """The code of a trajectory that watches conditions."""
+    """A module whose `run` integrates and watches conditions."""
 
     def write_derivatives(self):
         self._write_conditions()
@@ -73,7 +73,7 @@ class Watching(WatchMemory):
         return super().arrays | ({"multipliers": ("work", self.places["multipliers"])} if self.conditions.forces else {})
 
     def _write_conditions(self):
-        """Write `conditions(work)`: the conditions and their rates, at `state t`, `state q`, `result v` and `node a`."""
+        """Write `conditions(work)`: compute the conditions and their rates at `state t`, `state q`, `result v` and `node a`."""
         n, conditions, p = self.n, self.conditions, self.places
         inputs = [("work", p["state t"])]
         for name in ("state q", "result v", "node a"):
@@ -90,7 +90,10 @@ class Watching(WatchMemory):
                 self._write_forces(f, s)
 
     def _write_forces(self, f: Function, s: Lane):
-        """Write the forces of constraints, NaN if a pivot is too small, and their rates by differences."""
+        """Compute the watched forces and, by differences, their rates; they are stored after the conditions g.
+
+        Forces are NaN if a pivot is too small.
+        """
         self.copy(f, "state q", "force q")
         self.copy(f, "result v", "state v")
         step, before = f.const(FORCE_STEP, DOUBLE, f.width) / s.omega, getattr(s, "state t")
@@ -113,7 +116,10 @@ class Watching(WatchMemory):
         self.copy(f, "force q", "state q")
 
     def _write_look(self):
-        """Write `look(work)`: the state at the time `look`, projected in lanes that are `due`, and its conditions."""
+        """Write `look(work)`: interpolate the state at the time `look`, and evaluate its conditions.
+
+        The state is projected in lanes that are `due`.
+        """
         program = self.conditions.program
         f, s = self.function("look")
         work, following = f.given["work"], s.next
@@ -152,8 +158,8 @@ class Watching(WatchMemory):
     def _cut_intervals(self, f: Function, s: Lane):
         """Cut two intervals that cross the breakpoint, the end of a piece or the sudden change at which a step has ended.
 
-        The same where steps have become short beside the intervals: their first node must not precede the polynomial, whose first
-        point the next step drops.
+        They are also cut where steps have become short in comparison: their first node must not precede the first point of the
+        polynomial, which the next step drops.
         """
         abrupt = (s.abrupt > 0.5) | (s.first_t < s.point1_t)
         ends, end = abrupt, s.point3_t
@@ -168,7 +174,7 @@ class Watching(WatchMemory):
         s.where(cut, which=float(SECOND), node=node, behind_middle=end)
 
     def _write_watch(self):
-        """Write `watch(work)`: evaluate all nodes within accepted steps."""
+        """Write `watch(work)`: evaluate conditions at all nodes within accepted steps, and act on crossings."""
         f, s = self.function("watch")
         work, one = f.given["work"], f.const(1.0, DOUBLE, f.width)
 

@@ -28,7 +28,7 @@ _TWO_ARGUMENTS = ("atan2", "pow", "rem")
 
 
 def call(f: Function, name: str, *arguments: Operand) -> Value:
-    """Call an elementary function on numbers, lane by lane."""
+    """Return the elementary function `name` (of `NAMES`) of numbers, lane by lane, by a call of its function."""
     width = max((x.width for x in arguments if isinstance(x, Value)), default=1)
     return f.evaluate(_function(name, width), *(f.like(x, DOUBLE, width) for x in arguments))
 

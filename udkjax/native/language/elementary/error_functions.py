@@ -54,7 +54,7 @@ def erf(f: Function, x: Value) -> Value:
 
 
 def erfc(f: Function, x: Value) -> Value:
-    """Return 1 - erf x, accurate also where it is small."""
+    """Return 1 - erf x, accurate also for large x, where it is small."""
     size = f.abs(x)
     part = _small_part(f, size)
     small = f.select(x < 0.25, 1.0 - (x + copy_sign(f.abs(part), x)), 0.5 - (part + (x - 0.5)))

@@ -22,7 +22,7 @@ NEGLIGIBLE = 2.0**-54  # below, expm1 x rounds to x
 
 
 class Reduced(NamedTuple):
-    """e^x = 2^n (1 + high + low): n in the lowest bits of integers, `high` exact to the size of `low`."""
+    """The parts of e^x = 2^n (1 + high + low): n is in the lowest bits of the integer `n`, and `high` has no rounding error."""
 
     n: Value
     high: Value
@@ -30,12 +30,12 @@ class Reduced(NamedTuple):
 
     @property
     def fraction(self) -> Value:
-        """2^-n e^x, from 0.7 to 1.42."""
+        """The number 2^(-n) e^x, from 0.7 to 1.42."""
         return self.high + self.low + 1.0
 
 
 def reduce(f: Function, x: Value, low: Value | None = None) -> Reduced:
-    """Reduce e^(x + low), |low| < 2^-20, to 2^n e^r, with n the nearest integer to x / log 2."""
+    """Return the parts of e^(x + low) = 2^n e^r, with n the integer nearest to x / log 2; |low| must be below 2^-20."""
     number, n = nearest(f, x, 1.0 / LOG2)
     high = f.fma(number, -LOG2_PARTS[0], x)
     r = f.fma(number, -LOG2_PARTS[1], high if low is None else high + low)
@@ -56,7 +56,7 @@ def scale(x: Value, n: Value) -> Value:
 
 
 def clamp(x: Value, smallest: float, largest: float) -> Value:
-    """Return x between bounds; NaN stays."""
+    """Return x, or the bound that it exceeds; NaN stays."""
     f = x.f
     x = f.select(x > largest, largest, x)
     return f.select(x < smallest, smallest, x)

@@ -76,7 +76,11 @@ def atan2(f: Function, y: Value, x: Value) -> Value:
 
 
 class _Arcsine:
-    """The common parts of arcsine and arccosine for |x| >= 1/2: s = sqrt((1 - |x|) / 2), two doubles, and (asin s - s) / s."""
+    """The common parts of arcsine and arccosine.
+
+    With s^2 = (1 - |x|) / 2 for |x| >= 1/2 (`is_large`), else s = |x|, `ratio` is (asin s - s) / s. For large |x|, high + low is
+    asin s as a sum of two doubles, where `high` has 26 digits.
+    """
 
     def __init__(self, f: Function, x: Value):
         size = f.abs(x)

@@ -45,7 +45,7 @@ def _rest(f: Value, half_square: Value, low: Value | float = 0.0) -> Value:
 
 
 def _with_limits(x: Value, result: Value) -> Value:
-    """Return the logarithm of x, given it for positive finite x."""
+    """Return the logarithm of any x, where `result` is the logarithm for positive finite x."""
     f = x.f
     limit = f.select(x.is_(0.0), -INFINITY, f.select(x < 0.0, NAN, x))
     return f.select((x > 0.0) & (x < INFINITY), result, limit)
@@ -72,7 +72,10 @@ def log2(f: Function, x: Value) -> Value:
 
 
 def _of_all_numbers(x: Value, of_parts: Callable[[Value, Value], Value]) -> Value:
-    """Return a logarithm, which `of_parts` computes from k and m with x = 2^k m; once more if any number is unusual."""
+    """Return a logarithm of x, which `of_parts(k, m)` computes from x = 2^k m.
+
+    If a number in any lane is subnormal, not positive or not finite, all are computed again with subnormal numbers scaled.
+    """
     f, result = x.f, x.f.variable(of_parts(*Normal(x).mantissa(SQRT_HALF)), width=x.width)
     with f.if_(any_unusual(x)):
         number = Normal(x)
@@ -94,14 +97,14 @@ def _error_of_sum(f: Function, u: Value, x: Value) -> Value:
 
 
 def _log_of_sum(f: Function, u: Value, error: Value, x: Value, low: Value | float = 0.0) -> Value:
-    """Return log(u + error + low), for normal u + error, which is 1 + x if it is near one; `low` is negligible in x."""
+    """Return log(u + error + low) for normal u; near u = 1, from x = u + error - 1. `low` is negligible in comparison with x."""
     k, m = Normal(u).mantissa(SQRT_HALF)
     near = k.is_(0.0)
     return _log_of_parts(k, f.select(near, x, m - 1.0), (f.select(near, 0.0, error) + low) / u)
 
 
 def _log_with_double(f: Function, huge: Value, size: Value, t: Value, error: Value) -> Value:
-    """Return log(2 size) for `huge` numbers, and log(1 + t + error) for others."""
+    """Return log(2 size) in the lanes of `huge`, and log(1 + t + error) in others."""
     u = t + 1.0
     sum_error, error = f.select(huge, 0.0, _error_of_sum(f, u, t)), f.select(huge, 0.0, error)
     result = _log_of_sum(f, f.select(huge, size, u), sum_error, t, error)

@@ -1,4 +1,4 @@
-"""Parts of elementary functions: bits of float64 numbers, polynomials, and products that sums must not absorb."""
+"""Parts of elementary functions: bits of float64 numbers, polynomials, and products that must not be fused with sums."""
 
 from collections.abc import Sequence
 
@@ -33,7 +33,10 @@ def mask(b: Value, digits: int) -> Value:
 
 
 def upper_half(x: Value) -> Value:
-    """Return the upper 26 digits of numbers; a single number becomes the first of two to stay in a register for numbers."""
+    """Return the upper 26 digits of numbers.
+
+    A single number is put into a vector of two, so that it stays in a floating-point register.
+    """
     if x.width > 1:
         return from_bits(mask(bits(x), UPPER_HALF))
     f, kind = x.f, llvm_type(DOUBLE, 2)
@@ -52,18 +55,18 @@ def flip_sign(x: Value, sign: Value) -> Value:
 
 
 def any_unusual(x: Value) -> Value:
-    """Return whether any number is not positive, subnormal or not finite."""
+    """Return whether the number in any lane is subnormal, not positive or not finite."""
     f = x.f
     return f.any_of(~((x >= SMALLEST_NORMAL) & (x < INFINITY)))
 
 
 def power_of_two(b: Value) -> Value:
-    """Return 2^k, where the lowest 11 bits of integers hold k."""
+    """Return 2^k, where k is the integer in the lowest 11 bits of b."""
     return from_bits(shift(b + BIAS, "shl", FRACTION))
 
 
 def rounded(x: Value) -> Value:
-    """Return a product that sums do not absorb: it is rounded, or exact."""
+    """Return x marked as no product: sums do not fuse it to a multiply-add, so that the product is rounded unless it is exact."""
     x.product = None
     return x
 
@@ -75,7 +78,7 @@ def nearest(f: Function, x: Operand, factor: float = 1.0) -> tuple[Value, Value]
 
 
 def polynomial(x: Value, coefficients: Sequence[float]) -> Value:
-    """Return sum_k c_k x^k by halves, whose products do not wait for each other (Estrin)."""
+    """Return sum_k c_k x^k by Estrin's scheme: neighboring terms are joined in pairs, which do not wait for each other."""
     f, power = x.f, x
     terms: list[Operand] = list(coefficients)
     while len(terms) > 1:
@@ -87,7 +90,7 @@ def polynomial(x: Value, coefficients: Sequence[float]) -> Value:
 
 
 def quotient(f: Function, a: tuple[Operand, Operand], b: tuple[Value, Operand]) -> tuple[Value, Value]:
-    """Return a / b as a sum of two doubles, for numbers that are such sums."""
+    """Return a / b as a sum of two doubles, for a and b that are sums of two doubles."""
     inverse = 1.0 / b[0]
     result = rounded(inverse * a[0])
     error = f.fma(-result, b[0], a[0]) - f.fma(result, b[1], -a[1])
@@ -95,7 +98,7 @@ def quotient(f: Function, a: tuple[Operand, Operand], b: tuple[Value, Operand]) 
 
 
 class Normal:
-    """Positive numbers and their exponents, in variables: numbers that may be subnormal are scaled where `scale` is called."""
+    """Positive numbers whose mantissas are to be found. If any may be subnormal, `scale` must be called first."""
 
     def __init__(self, x: Value):
         self._x = x
@@ -108,7 +111,7 @@ class Normal:
         self.number.where(tiny, self.number.value * 2.0**54)
 
     def mantissa(self, start: int) -> tuple[Value, Value]:
-        """Return k and m with x = 2^k m, and m from the number with bits `start` to twice that number."""
+        """Return k and m with x = 2^k m, where m is between the number whose bits are `start` and twice this number."""
         b = bits(self.number.value) + (ONE - start)
         m = from_bits(mask(b, FRACTION_MASK) + start)
         return small_integer(shift(b, "lshr", FRACTION)) - self._bias.value, m

@@ -53,7 +53,7 @@ def pow(f: Function, x: Value, y: Value) -> Value:
 
 
 def _unusual_power(f: Function, x: Value, y: Value, result: Value) -> Value:
-    """Return x^y for any numbers, given |x|^y for finite |x| other than zero."""
+    """Return x^y for any numbers, where `result` is |x|^y for finite |x| other than zero."""
     size = f.abs(x)
     grows = f.logic("xor", size < 1.0, y > 0.0)
     result = f.select(size.is_(0.0) | size.is_(INFINITY), f.select(grows, INFINITY, 0.0), result)

@@ -8,7 +8,7 @@ DIGITS = 50
 
 
 def rem(f: Function, x: Value, y: Value) -> Value:
-    """Return x - n y with n = x / y rounded towards zero, and the sign of x."""
+    """Return x - n y, where n is x / y rounded towards zero; the result has the sign of x."""
     size, width = f.abs(y), x.width
     rest = f.variable(f.select(f.is_finite(x), f.abs(x), NAN), width=width)
     divisor = f.variable(f.select(size.is_(0.0), NAN, size), width=width)

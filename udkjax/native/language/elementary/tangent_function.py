@@ -52,7 +52,7 @@ LOW_HALF = 2**32 - 1
 
 
 class _Remainder(NamedTuple):
-    """x = n pi / 2 + high + low; the lowest bit of `n` is right."""
+    """The parts of x = n pi / 2 + high + low; only the lowest bit of `n` is correct, and only this bit is used."""
 
     high: Value
     low: Value
@@ -109,7 +109,7 @@ def _near_remainder(f: Function, x: Value) -> _Remainder:
 
 
 def _far_remainder(f: Function, x: Value) -> _Remainder:
-    """Return the remainder of x = m 2^e from m times 192 digits of 2 / pi, beginning with that of weight 2^(1 - e)."""
+    """Return the remainder of x = m 2^e from m times 192 digits of 2 / pi, beginning with the digit of weight 2^(1 - e)."""
     b = bits(x)
     m = f.logic("or", mask(b, FRACTION_MASK), 2**FRACTION)
     start = mask(shift(b, "lshr", FRACTION), 2047) - (BIAS + FRACTION - 62)
@@ -140,7 +140,7 @@ def _far_remainder(f: Function, x: Value) -> _Remainder:
 
 
 def _digits(f: Function, start: Value) -> list[Value]:
-    """Return three words of DIGITS from bit `start`."""
+    """Return three words of 64 bits from DIGITS, beginning at bit `start`."""
     index, offset = shift(start, "lshr", 6), mask(start, 63)
     words = [f.const(0, INT, start.width)] * 4
     for k in range(len(DIGITS) - 3):
@@ -167,5 +167,5 @@ def _high_product(a: Value, b: Value) -> Value:
 
 
 def _is_below(a: Value, b: Value) -> Value:
-    """Return whether a < b without signs."""
+    """Return whether a < b as unsigned integers."""
     return a.f.op(f"icmp ult {a.type} {a.name}, {b.name}", BOOL, a.width)
