@@ -24,13 +24,13 @@ class Accuracy(NamedTuple):
     violation: float  # largest violation of a constraint (m or rad)
     energy_change: float  # largest change of the total energy since the start (J); NaN if a link has no mass
     kinetic_energy: float  # J; NaN if a link has no mass
-    error: float | None  # largest difference of a coordinate from the exact solution (m or rad); None if none is known
+    error: float | None  # largest difference of a coordinate from the exact solution (m or rad); None if that is unknown
     work: float | None  # work of drivers, dampers, loads and impacts up to the end (J); None if energy is conserved
     length: float  # characteristic length, m
 
 
 def accuracy(mechanism: Mechanism, solution: Solution) -> Accuracy:
-    """Measure the accuracy of a run, or of the part that a failed run completed.
+    """Return the accuracy of a run, or of the part that a failed run completed.
 
     Args:
         mechanism: mechanism that was simulated.
@@ -53,7 +53,10 @@ def accuracy(mechanism: Mechanism, solution: Solution) -> Accuracy:
 
 
 def _energies(mechanism: Mechanism, solution: Solution) -> tuple[float, float, float | None]:
-    """Return the largest change of the total energy, the largest kinetic energy, and the work (J), or None without any."""
+    """Return the largest change of the total energy, the largest kinetic energy, and the work done up to the end (J).
+
+    The work is that of drivers, dampers, loads and impacts; None if energy is conserved.
+    """
     parts = energy(mechanism, solution)
     total = np.asarray(parts.total)
     good = total[np.isfinite(total)]
@@ -63,9 +66,10 @@ def _energies(mechanism: Mechanism, solution: Solution) -> tuple[float, float, f
 
 
 def conserves_energy(mechanism: Mechanism, ts: Float[ArrayLike, "T"]) -> bool:
-    """Return True if only errors can change the total energy: drivers are at rest, and all forces have constant potentials.
+    """Return True if only numerical errors can change the total energy of a mechanism during `ts` (s).
 
-    A potential with sampled numbers is constant if these are.
+    This requires drivers at rest, and forces whose potentials do not depend on time; both are checked at a few times between the
+    first and the last of `ts`. A potential with sampled numbers (`Held`) is constant if all its samples are equal.
     """
     from udkjax.integrate.events.law.conditions import frames_of  # imports the code of events, which other studies do not need
 
@@ -116,8 +120,8 @@ class Parallelogram(NamedTuple):
 def exact_coordinates(mech: Mechanism, ts, q0, v0, tol: float = 1e-8) -> Float[np.ndarray, "T bodies 3"] | None:
     """Return the exact x, y (m) and angle (rad) of all bodies at the times `ts` (s); None if this is not a parallelogram.
 
-    The motion starts at `ts[0]` from `q0`, `v0`, both (bodies, 3). Links count as equal and parallel within `tol` times their
-    length, since assembly closes the loops only up to rounding errors.
+    The motion starts at `ts[0]` from `q0`, `v0`, both (bodies, 3). Links count as equal and parallel if they differ by at most
+    `tol` times their length, since assembly closes the loops only up to rounding errors.
     """
     ts, q0, v0 = (np.asarray(array, float) for array in (ts, q0, v0))
     linkage = parallelogram(mech, q0, tol)
@@ -136,7 +140,7 @@ def exact_coordinates(mech: Mechanism, ts, q0, v0, tol: float = 1e-8) -> Float[n
 
 
 def as_pendulum(mech: Mechanism, linkage: Parallelogram) -> tuple[float, float]:
-    """Return phi (rad), the angle of a linkage from its hanging position, and omega (rad/s) of its small oscillations."""
+    """Return phi (rad), the angle from the hanging position, and omega (rad/s), the angular frequency of small oscillations."""
     bodies, gravity = list(mech.bodies.values()), np.asarray(mech.gravity, float)
     masses = np.array([float(bodies[link].mass) for link in linkage.links])
     load, arm = float(bodies[linkage.coupler].mass), linkage.arm
@@ -148,7 +152,7 @@ def as_pendulum(mech: Mechanism, linkage: Parallelogram) -> tuple[float, float]:
 
 
 def pendulum(ts, angle: float, rate: float, omega: float) -> Float[np.ndarray, " T"]:
-    """Return the change of phi (rad) at `ts`: the solution of phi'' = -omega^2 sin(phi) from `angle` and `rate` (rad/s).
+    """Return the change of phi (rad) after `ts` (s): the solution of phi'' = -omega^2 sin(phi) from `angle` and `rate` (rad/s).
 
     Oscillation (k <= 1): sin(phi / 2) = k sn(omega t + u, k). Rotation (k > 1): phi / 2 = am(k omega t + u, 1 / k). The first
     amplitude is computed by atan2, since asin would lose half of the digits at a release from rest.
@@ -171,7 +175,10 @@ def pendulum(ts, angle: float, rate: float, omega: float) -> Float[np.ndarray, "
 
 
 def parallelogram(mech: Mechanism, q0, tol: float) -> Parallelogram | None:
-    """Return the linkage in the configuration `q0`, (bodies, 3), if it is a parallelogram that moves under gravity alone."""
+    """Return the `Parallelogram` in the configuration `q0`, (bodies, 3), if the mechanism is one that moves under gravity alone.
+
+    Otherwise, return None. Links count as equal and parallel if they differ by at most `tol` times their length.
+    """
     if mech.drivers or mech.forces or not all(type(joint) is Revolute for joint in mech.joints.values()):
         return None
     pins = [dict(zip(joint.bodies, np.asarray(joint.points), strict=True)) for joint in mech.joints.values()]

@@ -14,14 +14,14 @@ TOO_LARGE = 0.5  # a step is too large if smaller steps disagree by more than th
 
 
 class Differences(NamedTuple):
-    """Differences R(h) at all steps except the last two, in S series: their sizes and errors, NaN where unknown."""
+    """Differences R(h) at all steps except the last two, in S series, as root mean squares over each; NaN where unknown."""
 
     steps: Float[np.ndarray, "H"]
     size: Float[np.ndarray, "H S"]
-    noise: Float[np.ndarray, "H S"]
+    noise: Float[np.ndarray, "H S"]  # errors of the differences, as `DifferenceSums` explains
     truncation: Float[np.ndarray, "H S"]
     largest: Float[np.ndarray, "S"]  # largest root mean square of the values
-    discrepancy: Float[np.ndarray, "H S"]  # from the derivative
+    discrepancy: Float[np.ndarray, "H S"]  # root mean square of the differences minus the derivative
     derivative_size: Float[np.ndarray, "S"]
     worst: Float[np.ndarray, "H S 3"]  # the row with the largest discrepancy, and the derivative and the difference there
 
@@ -65,7 +65,7 @@ class DifferenceSums:
         derivative: Float[np.ndarray, "R"] | None = None,
         rows: Int[np.ndarray, "R"] | None = None,
     ) -> None:
-        """Add rows.
+        """Add R rows of values at L steps.
 
         Args:
             y: values at +-steps; NaN where a run has failed, which excludes its step.
@@ -104,7 +104,10 @@ class DifferenceSums:
                     self._worst[k, s] = rows[worst], derivative[worst], values[worst]
 
     def differences(self, failed: Bool[np.ndarray, "L 2"] | None = None) -> Differences:
-        """Return the differences of all rows; `failed` marks values at +-steps that are excluded."""
+        """Return the differences of all rows that were added.
+
+        `failed` marks the steps and signs, (L, 2), whose values are excluded.
+        """
         h, mean = self._steps[:, None], lambda squares: np.sqrt(squares / self._rows)
         failed = np.zeros((len(h), 2), bool) if failed is None else failed
         lost = failed.any(1)
@@ -144,7 +147,7 @@ def _truncation(distances: Float[np.ndarray, "H H S"], noise: Float[np.ndarray, 
 
 
 def leave_out_far_steps(computed: Differences) -> Differences:
-    """Exclude differences whose steps lead to an entirely different motion."""
+    """Return the differences without those whose steps lead to an entirely different motion: their truncation errors are NaN."""
     h = computed.steps[:, None]
     far = (h * computed.derivative_size > computed.largest) & (h * computed.size > LEAST_CHANGE * computed.largest)
     return computed._replace(truncation=np.where(far, np.nan, computed.truncation))

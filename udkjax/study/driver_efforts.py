@@ -44,7 +44,7 @@ def driver_efforts(
         values: the coordinates along which the drivers exert efforts.
         weights: weight of each squared effort.
         ts: times (s).
-        motion: q, v and a.
+        motion: q, v and a of the prescribed motion.
 
     Returns:
         Efforts (N m, N) and rates (rad/s, m/s), each (k, T), and the part of M a - F that nothing exerts, relative to M a and the
@@ -114,11 +114,11 @@ def _free_part(J: Float[Array, "m n"]) -> Callable[[Array], Array]:
 
 
 def _slopes_of(elements: Sequence[Coordinate], body_names: Sequence[str]) -> Callable[[np.ndarray], np.ndarray]:
-    """Return the derivatives C (k, n, T) of coordinates by q, as a function of q (n, T), by NumPy.
+    """Return a NumPy function of q (n, T) that returns the derivatives C (k, n, T) of k coordinates with respect to q.
 
     With p the vectors from the origins of the bodies to their points, n the direction of the coordinate, and d from point 1 to
-    point 2, it changes by n . (dx2 + p2' dtheta2 - dx1 - p1' dtheta1), where ' is a quarter turn. If n turns with body 1, it
-    changes by n' . d dtheta1, too.
+    point 2, the coordinate changes by n . (dx2 + p2' dtheta2 - dx1 - p1' dtheta1), where ' is a quarter turn. If n turns with
+    body 1, the coordinate also changes by n' . d dtheta1.
     """
     places = [[None if body == GROUND else body_names.index(body) for body in element.bodies] for element in elements]
 
@@ -134,7 +134,7 @@ def _slopes_of(elements: Sequence[Coordinate], body_names: Sequence[str]) -> Cal
 
 
 def _slopes_of_one(element: Coordinate, bodies: Sequence[int | None], q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the derivatives (3, T) of a coordinate by the coordinates of body 2, and minus those by body 1's."""
+    """Return minus the derivatives (3, T) of a coordinate by x, y and angle of body 1, and its derivatives by those of body 2."""
     if element.coordinate == "angle":
         return np.array([[0.0], [0.0], [1.0]]), np.array([[0.0], [0.0], [1.0]])
     poses = [np.zeros((3, q.shape[1])) if k is None else q[3 * k : 3 * k + 3] for k in bodies]
@@ -154,7 +154,11 @@ def _slopes_of_one(element: Coordinate, bodies: Sequence[int | None], q: np.ndar
 
 @cached_by_identity
 def elements_of(mechanism: Mechanism, *drivers: str | Coordinate) -> tuple[Coordinate, ...]:
-    """Return the coordinates of drivers, as `element_of`. Raises `SceneError`."""
+    """Return the `Coordinate` of each driver, which is given as the name of a driver or coordinate, or as a `Coordinate`.
+
+    Raises:
+        SceneError: a name is neither a driver nor a coordinate, or a coordinate does not fit the mechanism.
+    """
     elements = tuple(element_of(mechanism, driver) for driver in drivers)
     if not all(isinstance(driver, str) for driver in drivers):
         with jax.ensure_compile_time_eval():  # a mechanism checks coordinates, however they are given

@@ -36,7 +36,7 @@ def explain(
 ) -> Explanation:
     """Derive the accelerations and multipliers of one state, step by step, with numbers; print the result.
 
-    F contains friction that depends on the loads of joints, as it is at the result.
+    F includes friction that depends on joint loads, computed with the loads of the result.
 
     Args:
         mechanism: mechanism with concrete numbers.
@@ -130,7 +130,7 @@ def _gauss(symbols: dict[str, np.ndarray], rank: int) -> Gauss:
 
 
 def _checks(symbols: dict[str, np.ndarray]) -> dict[str, float]:
-    """Return the residuals of the identities, each relative to its largest term."""
+    """Return the residuals of the equations and of Penrose's conditions by name, each relative to its largest term."""
     inertia, reaction = symbols["mass"] * symbols["a"], symbols["psi_q"].T @ symbols["multipliers"]
     required = symbols["b"] + symbols["D"] @ (
         np.sqrt(symbols["mass"]) * symbols["a_F"]

@@ -1,4 +1,4 @@
-"""Every symbol of the derivation for one state, as numbers and as text in the order of the paper's section 3."""
+"""Every symbol of the derivation for one state, as numbers and as text: see section 3 of the paper that `explain` names."""
 
 import html
 from typing import Any, NamedTuple
@@ -41,11 +41,13 @@ class RubbingTerms(NamedTuple):
     speed: float  # of sliding, s (m/s)
     coefficient: float  # mu(s)
     load: float  # N
-    is_unique: bool  # the load; otherwise it is that of least norm
+    is_unique: bool  # True if the load is unique; otherwise it is the load of least norm
 
 
 class Explanation(NamedTuple):
-    """Every symbol of section 3 of the paper for one state. Rows are those of Psi, columns x, y, angle of each body.
+    """Every symbol of section 3 of the paper (see `explain`) for one state, with a row for each equation of Psi.
+
+    Columns are x, y and angle of each body.
 
     Attributes:
         mechanism: the mechanism.
@@ -277,21 +279,21 @@ def _shown(count: int, most: int = MOST_ROWS, first: int = FIRST_ROWS) -> int:
 
 
 def _first(lines: list[str], left_out: str = "") -> list[str]:
-    """Return the first lines, and a line that counts the others or says `left_out`; all lines if they are few."""
+    """Return the first lines, and a line that counts the others or, if given, `left_out`; all lines if they are few."""
     shown = _shown(len(lines))
     rest = left_out or (f"and {len(lines) - shown} more" if shown < len(lines) else "")
     return [*lines[:shown], *([rest] if rest else [])]
 
 
 def _left_out(rows: int, columns: int) -> str:
-    """Return a line that counts the rows and columns of a matrix that are not printed; empty if there are none."""
+    """Return a line that counts the rows and columns of a matrix that are not printed; "" if there are none."""
     more_rows, more_columns = rows - _shown(rows), columns - _shown(columns, MOST_COLUMNS, FIRST_COLUMNS)
     counts = [plural(n, noun) for n, noun in ((more_rows, "row"), (more_columns, "column")) if n]
     return f"  and {' and '.join(counts)} more, in the fields of the explanation" if counts else ""
 
 
 def _table(rows: list[str], columns: list[str], values: np.ndarray) -> list[str]:
-    """Format a matrix with names of its rows and columns; wide matrices are split into blocks, large ones shown in part."""
+    """Return a matrix as lines, with names of rows and columns; wide matrices are split into blocks, large ones shown in part."""
     sizes = np.abs(values).max(axis=0 if values.shape[1] <= 3 else None, initial=0.0)
     left_out = _left_out(len(rows), len(columns))
     rows, columns = rows[: _shown(len(rows))], columns[: _shown(len(columns), MOST_COLUMNS, FIRST_COLUMNS)]

@@ -7,11 +7,14 @@ the joints' rows J and the drivers' rows C of Psi_q, the equation of motion is
 
 The joints carry any force in the range of J^T; the drivers must supply the rest. With N a basis of the null space of J,
 N^T (M a - F) = (C N)^T f: one equation for each degree of freedom. If there are more drivers than degrees of freedom, f is the
-solution with the least sum_i w_i f_i^2. Friction is in F, of both laws, with mu of least norm where it depends on the loads of
-joints; a joint at rest has none of the set-valued law (`holding_efforts` has the bounds), and one that starts from rest that of
-the direction in which it accelerates. Where branches meet, N has another
-column, along the other branch, in which the joints carry load too; with one degree of freedom, N is therefore replaced by the
-direction v of the motion.
+solution with the least sum_i w_i f_i^2.
+
+F includes smooth and set-valued friction; where friction depends on joint loads, these are computed with mu of least norm.
+Set-valued friction is zero in a joint at rest (`holding_efforts` gives its bounds), and in a joint that starts from rest it
+opposes the acceleration of sliding.
+
+Where branches meet, N has another column, along the other branch, in which the joints carry load, too; with one degree of
+freedom, N is therefore replaced by the direction v of the motion.
 """
 
 import math
@@ -49,7 +52,7 @@ from udkjax.wording import article, free_name, quote
 class InverseDynamics(PrintsTable):
     """Efforts (torques or forces) of drivers along their coordinates for a prescribed motion; NaN where undetermined.
 
-    They are undetermined where the motion is impossible, where its velocities are undetermined, and where branches meet in a
+    Efforts are undetermined where the motion is impossible, where its velocities are undetermined, and where branches meet in a
     mechanism with more than one degree of freedom.
     """
 
@@ -157,7 +160,7 @@ DRIVERS = ArgumentRequirement(
 
 
 def require_accelerated_history(name: str, value: Any, given: GivenArguments) -> None:
-    """Require times, states and accelerations, such as a `Kinematics` has."""
+    """Require that an argument has times, states and accelerations, as a `Kinematics` has."""
     require_history(name, value, given)
     if not hasattr(value, "a"):
         kind = type(value).__name__

@@ -32,20 +32,27 @@ Results: TypeAlias = tuple[dict[str, np.ndarray], dict[str, np.ndarray]]  # valu
 
 
 class MemberFunction(Protocol):
-    """A function of a member: arrays by name, from shared inputs, the member's inputs, and a shift (K,) of varied numbers."""
+    """A function that computes arrays by name for one member.
+
+    Its arguments are the inputs that all members share, the member's own inputs, and a shift (K,) that is added to the numbers
+    with respect to which derivatives are computed.
+    """
 
     def __call__(self, shared: Any, own: Any, shift: Array, /) -> Outputs: ...
 
 
 def structure_of(tree: PyTree) -> Hashable:
-    """Return a tree without the values of its arrays; trees with the same structure share a program."""
+    """Return a hashable key of everything in a tree except the values of its arrays; trees with equal keys share a program."""
     arrays, static = eqx.partition(tree, eqx.is_array)
     leaves, form = jax.tree.flatten(static)
     return jax.tree.structure(arrays), tuple((x.shape, str(x.dtype)) for x in jax.tree.leaves(arrays)), form, tuple(leaves)
 
 
 class Program:
-    """A function of members, compiled for `piece` members on each device, with derivatives for K = `slopes` numbers."""
+    """A function of members, compiled for `piece` members on each of `devices`, with derivatives for K = `slopes` numbers.
+
+    `function` computes a single member. Results are the values and their derivatives, both by name.
+    """
 
     def __init__(self, function: MemberFunction, slopes: int, piece: int, devices: Sequence[Any] = ()):
         self.function, self.slopes, self.piece, self.devices = function, slopes, piece, tuple(devices)
@@ -56,7 +63,10 @@ class Program:
         self._compiled: jax.stages.Compiled | None = None
 
     def __call__(self, shared: PyTree, own: PyTree, on_threads: bool = False) -> Results:
-        """Compute the members along the first axis of `own`, in order; pieces run in turn, or concurrently on threads."""
+        """Return values and derivatives of the members along the first axis of `own`, in order.
+
+        `shared` are the inputs that all members share. Pieces run in turn or, with `on_threads`, concurrently.
+        """
         count = len(jax.tree.leaves(own)[0])
         program = self.compile(shared, own)
 
@@ -67,11 +77,11 @@ class Program:
         return jax.tree.map(lambda *x: np.concatenate(x)[:count], *each(compute, range(0, count, self.size)))
 
     def place(self, shared: T, own: PyTree) -> T:
-        """Compile for members like these, and return the shared inputs on the devices, where repeated calls can use them."""
+        """Compile for inputs of this kind, and return the shared inputs on the devices, where repeated calls can use them."""
         return jax.device_put(shared, self.compile(shared, own).input_shardings[0][0])
 
     def compile(self, shared: PyTree, own: PyTree) -> jax.stages.Compiled:
-        """Return the executable for members like these, compiled once."""
+        """Return the executable for inputs of this kind, which is compiled once."""
         with self._lock:
             if self._compiled is None:
                 self._compiled = _compile(self._trace(shared, own).lower(), self.devices)
@@ -80,7 +90,7 @@ class Program:
         return self._compiled
 
     def shapes(self, shared: PyTree, own: PyTree) -> tuple[dict[str, jax.ShapeDtypeStruct], dict[str, jax.ShapeDtypeStruct]]:
-        """Return shapes and types of the values and slopes of one member."""
+        """Return shapes and types of the values and of the derivatives of one member, both by name."""
         with self._lock:
             shapes = self._shapes
             if shapes is None:
@@ -89,13 +99,13 @@ class Program:
             return shapes
 
     def _trace(self, shared: PyTree, own: PyTree) -> jax.stages.Traced:
-        """Return the traced program, until it is compiled: its shapes and its executable take one trace."""
+        """Return the traced program, which is kept until it is compiled, so that shapes and executable need a single trace."""
         if self._traced is None:
             self._traced = jax.jit(self._on_devices()).trace(shared, _rows(own, 0, self.size))
         return self._traced
 
     def _compute(self, shared: PyTree, own: PyTree) -> tuple[Outputs, Outputs]:
-        """Compute values of members, and slopes of the floating-point values."""
+        """Return values of members, and derivatives of those that are floating-point numbers."""
         alone = len(jax.tree.leaves(own)[0]) == 1
 
         def values(shift: Array) -> tuple[Outputs, Outputs]:
@@ -145,7 +155,7 @@ def _compile(lowered: jax.stages.Lowered, devices: tuple[Any, ...]) -> jax.stage
 
 
 def _rows(own: T, first: int, count: int) -> T:
-    """Return the inputs of some members, padded with copies of the last."""
+    """Return the inputs of `count` members from the index `first` on, padded with copies of the last member."""
     return jax.tree.map(lambda x: x[np.minimum(np.arange(first, first + count), len(x) - 1)], own)
 
 
@@ -173,12 +183,12 @@ def concurrent_chunks() -> int:
 
 
 def machine() -> str:
-    """Name the processor, the number of its cores that may be used, and the system."""
+    """Return the name of the processor, the number of its cores that may be used, and the system, as text."""
     return f"{processor()}, {cores()} of {os.cpu_count()} cores, {platform.system()} {platform.release()}"
 
 
 def processor() -> str:
-    """Name the processor."""
+    """Return the name of the processor."""
     info = Path("/proc/cpuinfo")
     lines = info.read_text(encoding="utf-8", errors="replace").splitlines() if info.exists() else []
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]

@@ -19,7 +19,7 @@ def noise_of_differences(times: Float[np.ndarray, "N"], values: Float[np.ndarray
     """Estimate the standard deviation of the noise from the distances between values and the lines through their neighbours.
 
     The median of these distances, scaled to unit noise, is insensitive to outliers. The signal should be nearly straight between
-    samples, since its curvature counts as noise. NaN for fewer than three values.
+    samples, since its curvature counts as noise. The estimate is NaN if there are fewer than three values.
 
     Source: T. Gasser, L. Sroka & C. Jennen-Steinmetz, Residual variance and residual pattern in nonlinear regression, 1986.
     """
@@ -38,9 +38,9 @@ def robust_deviation(values: Float[np.ndarray, "N"]) -> float:
 
 
 def outlier_rows(values: Float[np.ndarray, "N"]) -> Bool[np.ndarray, "N"]:
-    """Return a mask of numbers that are too large to be noise; a thousandth of the series of Gaussian noise has such numbers.
+    """Return a mask of the values that are too large to be noise; one of a thousand series of Gaussian noise has such values.
 
-    Series of more than `MOST_TOGETHER` are not outliers; they are part of the signal.
+    More than `MOST_TOGETHER` such values in succession are not outliers, but part of the signal.
     """
     limit = ndtri(1.0 - 0.5 * SIGNIFICANCE / max(len(values), 1)) * robust_deviation(values) if len(values) else np.inf
     mask = np.abs(values) > limit if limit > 0.0 else np.zeros(len(values), bool)
@@ -65,7 +65,7 @@ class Whiteness(NamedTuple):
         return not self.p < SIGNIFICANCE
 
     def text(self, channel: str) -> str:
-        """Return a sentence about residuals that are not white; empty if they are."""
+        """Return a sentence about residuals that are not white; "" if they are."""
         if self.white:
             return ""
         return (
@@ -120,16 +120,16 @@ def whiteness_of(
 class HatBands:
     """The diagonal and the first upper diagonals of H = U U^T, from rows of U that come in sequence.
 
-    `values` (1 + MAX_LAGS, N) are H_(i, i+k), at k and i, zero where i + k is no row.
+    `values[k, i]`, of shape (1 + MAX_LAGS, N), is H_(i, i+k); it is zero if there is no row i + k.
     """
 
     def __init__(self, count: int, columns: int):
-        """Prepare for `count` rows U (D = `columns`)."""
+        """Prepare for `count` rows of U, which has D = `columns` columns."""
         self.values = np.zeros((MAX_LAGS + 1, count))
         self._latest, self._next = np.zeros((0, columns)), 0  # the latest rows, and the index of the next
 
     def add(self, U: Float[np.ndarray, "n D"]) -> None:
-        """Add rows."""
+        """Add the next n rows of U."""
         rows, before = np.concatenate([self._latest, U]), len(self._latest)
         first, self._next = self._next - before, self._next + len(U)
         for k in range(min(MAX_LAGS + 1, len(rows))):

@@ -24,7 +24,7 @@ Setter = TypeAliasType("Setter", Callable[[Any, NumberLike], StudyModel])  # (me
 
 @dataclass(frozen=True)
 class Length:
-    """Sets the length (m) of bodies, all to the same value: see `with_length`."""
+    """A function of a mechanism and a value that sets the length (m) of bodies, all to this value: see `with_length`."""
 
     bodies: tuple[str, ...]
     as_rod: bool = False
@@ -38,7 +38,7 @@ class Length:
 
 @dataclass(frozen=True)
 class InitialAngle:
-    """Sets the initial angle (rad) of bodies: see `with_angle`."""
+    """A function of a mechanism and a value that sets the initial angle (rad) of bodies: see `with_angle`."""
 
     bodies: tuple[str, ...]
 
@@ -48,7 +48,7 @@ class InitialAngle:
 
 @dataclass(frozen=True)
 class Scaled:
-    """Sets several parameters in proportion to one value."""
+    """A function of a mechanism and a value that sets several parameters, each to its factor times the value."""
 
     factors: Mapping[str, float]
 
@@ -66,7 +66,7 @@ def parameter_value(mechanism: StudyModel, name: str) -> Array:
 @deferred
 @defined
 def jacobians_at(system: Any, t: Any, q: Any, v: Any) -> Any:
-    """Return Psi_q, and the rows (Psi_q; phi_v), of a system of traced functions at a state."""
+    """Return Psi_q, and the rows (Psi_q; phi_v), at a state of a system whose functions are traced."""
     equations: Any = equations_of(system, SVD())
     t, q, v = (jnp.asarray(x, float) for x in (t, q, v))
     rows = equations.jacobian(t, q, v)

@@ -1,4 +1,4 @@
-"""Tolerances at which the default has an accuracy, from the table that `python -m experiments atlas` writes."""
+"""Tolerances that runs with default settings need for an accuracy, as measured by `python -m experiments atlas`."""
 
 import json
 from functools import cache
@@ -7,9 +7,10 @@ from typing import NamedTuple
 
 
 class NeededTolerances(NamedTuple):
-    """A mechanism of the atlas: its scene's name, its description, and the default's tolerances by the error that they reach.
+    """A mechanism of the atlas: the name of its scene, a description, and the tolerances that runs with default settings need.
 
-    An error is the largest of any position, relative to the mechanism's length, or of an angle (rad).
+    `tolerances` maps errors, as text, to the tolerance that reaches each. An error is the largest of any position, relative to
+    the mechanism's length, or of an angle (rad).
     """
 
     name: str
@@ -19,13 +20,16 @@ class NeededTolerances(NamedTuple):
 
 @cache
 def needed_tolerances() -> tuple[NeededTolerances, ...]:
-    """Return the tolerances that each mechanism of the atlas needed."""
+    """Return the tolerances that each mechanism of the atlas needs."""
     text = (files("udkjax.study") / "atlas.json").read_text(encoding="utf-8")
     return tuple(NeededTolerances(**entry) for entry in json.loads(text))
 
 
 def tolerance_lines(name: str) -> list[str]:
-    """Return, for each error, the range of tolerances that all mechanisms needed, and the tolerances for those of this name."""
+    """Return lines of text: for each error, the range of tolerances that the mechanisms of the atlas need.
+
+    If the atlas has mechanisms named `name`, their own tolerances follow.
+    """
     table = needed_tolerances()
     errors = list(dict.fromkeys(error for one in table for error in one.tolerances))
     lines = []

@@ -27,7 +27,7 @@ def format_value(value: float, error: float) -> str:
 
 
 def row_label(mechanism: Mechanism, constraint: str, row: int) -> str:
-    """Name one row of a constraint, such as `B2 (y)`."""
+    """Return the name of one row of a constraint, such as `B2 (y)`."""
     kind = type(mechanism.constraints[constraint]).__name__
     return f"{constraint} ({_ROWS[kind][row] if kind in _ROWS else f'row {row + 1}'})"
 

@@ -38,28 +38,32 @@ LEAST = -600.0  # least coordinate, relative to SOFT, whose exponential is not r
 
 
 class ChainCoordinates(NamedTuple):
-    """The coordinates w of chains, of the unconstrained vector x with its mode.
+    """The coordinates w in which chains move, as functions of the unconstrained vector x.
 
-    Where `linear`, the ratio of a number to its mode is exp(x - mode) = s log(1 + exp(w / s)), with s = 0.1, which is w unless
-    it is small; elsewhere w = x - mode.
+    For entries that are `linear`, the ratio of a number to its mode is exp(x - mode) = s log(1 + exp(w / s)), with s = 0.1; this
+    ratio is w itself unless w is small. For all other entries, w = x - mode.
+
+    Attributes:
+        mode: the unconstrained vector of the largest density.
+        linear: mask of the entries whose coordinate is the ratio of the number to its mode.
     """
 
     mode: Float[np.ndarray, "K"]
     linear: Bool[np.ndarray, "K"]
 
     def x(self, w: Any, xp: Any = np) -> Any:
-        """Return unconstrained vectors (..., K), by NumPy or JAX."""
+        """Return the unconstrained vectors x at coordinates w, both (..., K), by NumPy or, with `xp` `jax.numpy`, by JAX."""
         y = xp.maximum(xp.where(self.linear, w, SOFT) / SOFT, LEAST)
         return self.mode + xp.where(self.linear, xp.log(SOFT * xp.logaddexp(y, 0.0)), w)
 
     def log_slope(self, w: Any) -> Any:
-        """Return the logarithm of the determinant of dx/dw (K, K), by JAX."""
+        """Return the logarithm of the determinant of dx/dw at coordinates w (K,), by JAX."""
         y = jnp.maximum(jnp.where(self.linear, w, SOFT) / SOFT, LEAST)
         slopes = -jnp.logaddexp(0.0, -y) - jnp.log(SOFT * jnp.logaddexp(y, 0.0))
         return jnp.sum(jnp.where(self.linear, slopes, 0.0))
 
     def w(self, x: Float[np.ndarray, "... K"]) -> Float[np.ndarray, "... K"]:
-        """Return the coordinates of unconstrained vectors."""
+        """Return the coordinates w of unconstrained vectors x."""
         ratio = np.exp(np.where(self.linear, x - self.mode, 0.0))
         return np.where(self.linear, ratio + SOFT * np.log(-np.expm1(-ratio / SOFT)), x - self.mode)
 
@@ -73,20 +77,20 @@ def coordinates_of(
 
 
 class Tuning(NamedTuple):
-    """The size of steps for unit covariance, and the covariance (K, K) of the coordinates."""
+    """The tuning of chains: the size of leapfrog steps for unit covariance, and the covariance (K, K) of the coordinates."""
 
     step: float
     covariance: Float[np.ndarray, "K K"]
 
 
 class Randomness(NamedTuple):
-    """The random numbers of D draws of C chains, by NumPy: XLA would compile its own generator for longer than all of a chain.
+    """The random numbers of D draws of C chains, from NumPy: compiling XLA's generator would take longer than a whole chain.
 
     Attributes:
         momentum: standard normal numbers (D, C, K).
         log_uniform: logarithms of uniform numbers (D, C), which decide acceptance.
-        steps: numbers of steps of the trajectories (D,).
-        size: their sizes, for unit covariance (D,).
+        steps: numbers of leapfrog steps of the trajectories (D,).
+        size: sizes of these steps, for unit covariance (D,).
     """
 
     momentum: Float[np.ndarray, "D C K"]
@@ -96,7 +100,14 @@ class Randomness(NamedTuple):
 
     @classmethod
     def of_chunk(cls, seed: int, k: int, step: float, shape: tuple[int, int]) -> "Randomness":
-        """Return the random numbers of chunk k, for chains and unknowns of this shape (C, K)."""
+        """Return the random numbers of chunk k.
+
+        Args:
+            seed: seed of all chunks.
+            k: number of the chunk.
+            step: size of leapfrog steps for unit covariance, which is multiplied by a random factor for each draw.
+            shape: numbers of chains and of unknowns (C, K).
+        """
         random = np.random.default_rng([seed, k])
         size = step * random.uniform(*STEP_FACTORS, DRAWS)
         steps = np.clip(np.round(LENGTH * random.uniform(*LENGTHS, DRAWS) / size), 1, MOST_STEPS).astype(int)
@@ -106,7 +117,8 @@ class Randomness(NamedTuple):
 class ChainState(NamedTuple):
     """The state of C chains: positions (C, K), logarithms of the density (C,), and their gradients (C, K).
 
-    With a density of zero, -inf, and zero gradient, the next proposal of positive density is accepted.
+    If the density of a chain is zero (the logarithm is -inf, the gradient zero), the next proposal of positive density is
+    accepted.
     """
 
     position: Any
@@ -118,14 +130,15 @@ DrawChunk = Mapping[str, np.ndarray]  # arrays of a chunk by name, draws first
 
 
 def first_state(positions: Float[np.ndarray, "C K"]) -> ChainState:
-    """Return the state of chains at positions where the density has not been evaluated."""
+    """Return the state of chains at positions where the density has not been evaluated, and counts as zero."""
     return ChainState(positions, np.full(len(positions), -np.inf), np.zeros(positions.shape))
 
 
 def compile_draws(problem: InferenceProblem) -> Callable[..., tuple[ChainState, dict[str, Array]]]:
-    """Return a compiled function of coordinates, a root of the covariance, randomness and the state.
+    """Return a compiled function that computes a chunk of draws of all chains.
 
-    It returns the next state, and draws.
+    Its arguments are the `ChainCoordinates`, a root (K, K) of the covariance, the `Randomness` of the chunk, and the
+    `ChainState`. It returns the state after the chunk, and arrays (D, C, ...) of the draws by name.
     """
 
     def chunk(
@@ -165,8 +178,9 @@ def compile_draws(problem: InferenceProblem) -> Callable[..., tuple[ChainState, 
 def tuned(first: Tuning, warmup: Sequence[DrawChunk]) -> Tuning:
     """Return the tuning that follows from the first one and the chunks of the warm-up so far.
 
-    The errors of the energy, whose size is proportional to the square of the step, decide acceptance, 2 Phi(-s / 2) for errors
-    of deviation s. The covariance is that of the later half of the draws of all chains.
+    If the errors of the energy have a standard deviation s, 2 Phi(-s / 2) of the proposals are accepted, and s is proportional to
+    the square of the step: this relation gives the step for the wanted acceptance. The covariance is that of the later half of
+    the draws of all chains.
     """
     tunings = [first]
     for k in range(1, len(warmup) + 1):
@@ -181,13 +195,13 @@ def tuned(first: Tuning, warmup: Sequence[DrawChunk]) -> Tuning:
 
 
 def settled(first: Tuning, warmup: Sequence[DrawChunk]) -> Tuning:
-    """Return the tuning after the warm-up: the covariance of its later half, and the mean step there."""
+    """Return the tuning after the warm-up: the covariance of its later half, and the geometric mean of the steps there."""
     later = [tuned(first, warmup[:k]).step for k in range(len(warmup) // 2, len(warmup) + 1)]
     return Tuning(float(np.exp(np.mean(np.log(later)))), tuned(first, warmup).covariance)
 
 
 def covariance_of(previous: Float[np.ndarray, "K K"], w: Float[np.ndarray, "N K"]) -> Float[np.ndarray, "K K"]:
-    """Return the covariance of draws; with few of them, mostly the previous one."""
+    """Return a weighted mean of the previous covariance and that of the draws w, whose weight grows with their number."""
     K = len(previous)
     weight = PRIOR_DRAWS * K / (PRIOR_DRAWS * K + len(w))
     return (1.0 - weight) * np.cov(w.T, ddof=0).reshape(K, K) + weight * previous

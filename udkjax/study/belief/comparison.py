@@ -1,9 +1,9 @@
 """Comparison of models of the same records: which friction law, which damper, which number of springs.
 
-The evidence of a model is the integral of its prior times its likelihood. With equal chances before the measurements, models are
-right with probabilities in proportion to it; a model with more parameters must earn the volume of their prior. Leave-one-out
-compares how well each value is predicted from all others, needs no priors, but hardly decides between a model and one that
-contains it.
+The evidence of a model is the integral of its prior times its likelihood. If models are equally probable before the measurements,
+their probabilities afterwards are proportional to their evidence; further parameters must earn the volume of their prior.
+Leave-one-out compares how well each value is predicted from all others; it needs no priors, but hardly decides between a model
+and one that contains it.
 R. E. Kass & A. E. Raftery, Journal of the American Statistical Association 90 (1995) 773; A. Vehtari, A. Gelman & J. Gabry,
 Statistics and Computing 27 (2017) 1413.
 """
@@ -50,7 +50,7 @@ class Comparison(NamedTuple):
         scores: logarithms of the evidence, or of the density of each value predicted from all others, summed.
         errors: standard errors of the scores: of importance sampling, or of the sum over values.
         differences: scores relative to that of the best model.
-        difference_errors: their standard errors.
+        difference_errors: standard errors of the differences.
         probabilities: probabilities of the models by their evidence, if they were equally probable before; else NaN.
         exponents: exponent k of the importance weights of each model; scores are reliable up to 0.67.
     """
@@ -147,7 +147,10 @@ def _require_same_records(models: Mapping[str, Laplace | Posterior]) -> None:
 
 
 def _require_priors(models: Mapping[str, Laplace | Posterior]) -> None:
-    """Raise an error if a number without a proper prior is not in all models, where its volume would cancel."""
+    """Raise an error if some models, but not all, have a number without a proper prior.
+
+    The prior of such a number has no finite volume; this volume only cancels in a comparison if all models have the number.
+    """
     without = {
         name: [n for n, p in zip(m.problem.names, m.problem.prior.proper, strict=True) if not p] for name, m in models.items()
     }
@@ -162,7 +165,7 @@ def _require_priors(models: Mapping[str, Laplace | Posterior]) -> None:
 
 
 def _evidence(model: Laplace | Posterior) -> tuple[float, float, float]:
-    """Return the logarithm of the evidence, its standard error, and the exponent of the importance weights."""
+    """Return the logarithm of a model's evidence, its standard error, and the exponent of the importance weights."""
     if isinstance(model, Posterior):
         x = model.x.reshape(-1, model.x.shape[2])
         model = weigh(model.problem, x.mean(0), np.linalg.cholesky(np.cov(x.T).reshape(x.shape[1], -1)))
@@ -170,7 +173,7 @@ def _evidence(model: Laplace | Posterior) -> tuple[float, float, float]:
 
 
 def _left_out(model: Laplace | Posterior) -> tuple[Float[np.ndarray, "R"], float]:
-    """Return the log density of each measured value, predicted from all others, and the largest exponent of the weights."""
+    """Return the log density of each measured value, predicted from all others, and the largest exponent of the weights (k)."""
     if isinstance(model, Posterior):
         x = model.x.reshape(-1, model.x.shape[2])
         x, weights = x[:: -(-len(x) // DRAWS)], 0.0
@@ -185,5 +188,5 @@ def _left_out(model: Laplace | Posterior) -> tuple[Float[np.ndarray, "R"], float
 
 
 def _error_of_sum(each: Float[np.ndarray, "N R"]) -> Float[np.ndarray, "N"]:
-    """Return the standard errors of sums over values."""
+    """Return the standard error of the sum of the R values of each row."""
     return np.sqrt(each.shape[1] * each.var(axis=1))

@@ -6,8 +6,8 @@ other parameters) are eliminated by projecting J on the complement of their colu
 (criterion "D"), the smallest trace M^-1 ("A"), or the largest smallest eigenvalue of M ("E"), in the dimensionless unknowns of
 `identify/problem/parameters.py`. F. Pukelsheim, Optimal Design of Experiments, 2006.
 
-J depends on the parameters. Draws from a posterior show which values are possible: with these, the criterion is its mean over the
-draws, with the inverse of their covariance as prior information. For "D", this is the expected gain of information, up to a
+J depends on the parameters. Draws from a posterior show which values are possible: the criterion is then averaged over the draws,
+and the inverse of their covariance is prior information. For "D", this is the expected gain of information, up to a
 factor and a constant. K. Chaloner & I. Verdinelli, Statistical Science 10 (1995) 273.
 """
 
@@ -49,7 +49,7 @@ class Candidate:
     Args:
         conditions: numbers of the scene that differ in this experiment, by name.
         initial_state: initial state of this experiment; by default that of the scene.
-        name: its name in tables.
+        name: name of the candidate in tables; by default its number.
     """
 
     conditions: Mapping[str, Numbers] = field(default_factory=dict)
@@ -67,8 +67,8 @@ class Design(NamedTuple):
         candidates: names of the candidates.
         scores: value of the criterion (larger is better): log det M, -trace M^-1, or the smallest eigenvalue; -inf or 0 if a
             combination of parameters is not determined.
-        standard_errors: standard errors in the units of the parameters; inf if a candidate does not determine the parameter. Of a
-            posterior, their root mean square over its draws.
+        standard_errors: standard errors in the units of the parameters; inf if a candidate does not determine the parameter. With
+            draws from a posterior, they are root mean squares over the draws.
         order: indices of the candidates, the best first.
         chosen: candidates to carry out together, the most useful first.
         together: standard errors after the first chosen candidate, the first two, and so on.
@@ -95,7 +95,7 @@ class Design(NamedTuple):
 
 
 def _are_channels(x: Any) -> bool:
-    """Return True for a list of names of channels, and of user-defined quantities."""
+    """Return True if x is a list of channels: names, or user-defined quantities."""
     is_list = isinstance(x, Sequence) and not isinstance(x, str) and len(x) > 0
     return is_list and all(isinstance(channel, str) or hasattr(channel, "name") for channel in x)
 
@@ -172,7 +172,7 @@ def design_experiment(
     floors = [INVISIBLE_RATIO * np.linalg.norm(np.concatenate([prior_rows, *own]), 2) for own in roots]
 
     def evaluate(which: Sequence[int]) -> tuple[tuple[int, float], np.ndarray]:
-        """Return the number of determined directions and the score, and the standard errors, with some of the candidates."""
+        """Return (number of determined directions, score) and the standard errors if these candidates are carried out."""
         found = []
         for own, floor in zip(roots, floors, strict=True):
             rows = np.concatenate([prior_rows, *(own[k] for k in which)])
@@ -231,7 +231,7 @@ def _require_same(names: Sequence[str], given: Sequence[str], what: str) -> None
 
 
 def _places(problem: FitProblem, given: Estimate | Posterior | None) -> Float[np.ndarray, "S P"]:
-    """Return the parameters' unknowns at which experiments are predicted: zero, those of the mechanism; or all draws."""
+    """Return the points z at which experiments are predicted: all draws of a posterior, or zero, the mechanism's values."""
     u = problem.unknowns
     if not isinstance(given, Posterior):
         return np.zeros((1, len(u.names)))
@@ -246,12 +246,15 @@ def _places(problem: FitProblem, given: Estimate | Posterior | None) -> Float[np
 
 
 def _covariance_rows(z: Float[np.ndarray, "S P"]) -> np.ndarray:
-    """Return rows J, with J^T J the inverse of the covariance of draws."""
+    """Return rows J for which J^T J is the inverse of the covariance of draws z."""
     return np.linalg.inv(np.linalg.cholesky(np.cov(z.T).reshape(z.shape[1], -1)))
 
 
 def _information_of_records(problem: FitProblem, z: Float[np.ndarray, "K"], tol: TolerancePair) -> list[np.ndarray]:
-    """Return rows J (., P) for each record, whose information is J^T J; no rows if a record cannot be computed."""
+    """Return, for each record, rows J (., P) whose information about the parameters is J^T J, with initial states eliminated.
+
+    A record that cannot be computed has no rows.
+    """
     P, fine = len(problem.unknowns.names), np.ones(len(problem.records), bool)
     reduced = [Reduction(problem.K) for _ in problem.records]
     for block in problem.row_blocks(z[None], tol):
@@ -267,7 +270,10 @@ def _information_of_records(problem: FitProblem, z: Float[np.ndarray, "K"], tol:
 
 
 def _prior_information(problem: FitProblem, given: Estimate | None) -> np.ndarray:
-    """Return rows J; J^T J is the prior information, from the records of an estimate and from priors."""
+    """Return rows J (., P) for which J^T J is the prior information.
+
+    It is the information of the records and priors of an estimate, if one is given; otherwise that of the priors of `problem`.
+    """
     u = problem.unknowns
     which = problem.priors
     priors = np.zeros((len(which), len(u.names)))
@@ -287,7 +293,10 @@ def _prior_information(problem: FitProblem, given: Estimate | None) -> np.ndarra
 
 
 def _eliminate(J: np.ndarray, columns: np.ndarray, floor: float) -> np.ndarray:
-    """Return J without `columns`, projected on the complement of these."""
+    """Return J without `columns`, with its other columns projected on the orthogonal complement of those.
+
+    Singular values of the eliminated columns up to `floor` count as zero.
+    """
     others = np.delete(J, columns, axis=1)
     if not len(columns) or not len(J):
         return others
@@ -297,7 +306,10 @@ def _eliminate(J: np.ndarray, columns: np.ndarray, floor: float) -> np.ndarray:
 
 
 def _score(rows: np.ndarray, criterion: Criterion, floor: float) -> tuple[tuple[int, float], np.ndarray]:
-    """Return the number of determined directions and their score, and the standard errors of the unknowns."""
+    """Return (number of determined directions, score) and the standard errors of the unknowns (K,) for rows J of the information.
+
+    Directions whose singular value is at most `floor` are not determined; the errors of unknowns that change along them are inf.
+    """
     K = rows.shape[1]
     _, s, vt = np.linalg.svd(np.concatenate([rows, np.zeros((K, K))]))
     determined = s > floor

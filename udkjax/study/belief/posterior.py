@@ -27,7 +27,10 @@ MOST_BAD = 0.01  # share of divergent or failed proposals above which it is repo
 
 
 class PosteriorRow(NamedTuple):
-    """The posterior of a number: mean, standard deviation, 94 % interval, R-hat, and effective numbers of draws."""
+    """The posterior of an unknown: mean, standard deviation, ends of the 94 % interval, R-hat, and effective numbers of draws.
+
+    `bulk` is the effective number for the mean, `tail` that for the 5 % and 95 % quantiles.
+    """
 
     parameter: str
     mean: float
@@ -49,9 +52,9 @@ class Posterior:
         x: unconstrained vectors (C, draws, K).
         log_density: logarithms of the density (C, draws).
         acceptance: probability with which each proposal was accepted (C, draws).
-        divergent: proposals with an energy error above 1000 (C, draws).
-        failed: proposals of zero density, as where a run fails, which were rejected (C, draws).
-        steps: number of gradients of each draw, the same for all chains (draws,).
+        divergent: True for proposals with an energy error above 1000 (C, draws).
+        failed: True for rejected proposals of zero density, as where a run fails (C, draws).
+        steps: number of gradients that each draw took, the same for all chains (draws,).
         requested: number of draws of a chain that were asked for; fewer were drawn before an interruption.
         step: size of the steps, for unit covariance.
     """
@@ -70,7 +73,15 @@ class Posterior:
     def of(
         cls, problem: InferenceProblem, coordinates: ChainCoordinates, chunks: Sequence[DrawChunk], draws: int, step: float
     ) -> "Posterior":
-        """Join chunks of draws."""
+        """Return the posterior with the first `draws` draws of each chain, from chunks of draws.
+
+        Args:
+            problem: the density.
+            coordinates: the coordinates in which the chains moved.
+            chunks: arrays by name, as the function of `compile_draws` returns them, and the numbers of steps.
+            draws: number of draws of a chain that were asked for.
+            step: size of the steps, for unit covariance.
+        """
         joined = {name: np.concatenate([chunk[name] for chunk in chunks])[:draws] for name in ("position", "steps", *PER_DRAW)}
         x = coordinates.x(np.swapaxes(joined["position"], 0, 1))
         of_chains = {name: np.swapaxes(joined[name], 0, 1) for name in PER_DRAW}
@@ -78,18 +89,18 @@ class Posterior:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the unknowns, as those of the problem."""
+        """Names of the K unknowns."""
         return self.problem.names
 
     @cached_property
     def draws(self) -> dict[str, Float[np.ndarray, "C draws"]]:
-        """Draws (C, draws) by name, in the units of the parameters."""
+        """Draws of each unknown by name, in the units of the parameters."""
         values = self.problem.unknowns.values(self.x)
         return {name: values[..., k] for k, name in enumerate(self.names)}
 
     @cached_property
     def rows(self) -> tuple[PosteriorRow, ...]:
-        """One row per unknown."""
+        """The rows of the summary, one per unknown."""
         with OptionalImport():
             import arviz
         rows = []
@@ -165,11 +176,14 @@ class Posterior:
         return older.InferenceData(**groups) if arviz.__version__.startswith("0.") else xarray.DataTree.from_dict(groups)
 
     def prediction_intervals(self, draws: int = PREDICTIONS, seed: int = 0) -> tuple[dict[str, Float[np.ndarray, "3 T"]], ...]:
-        """Return the range of 94 % of repeated measurements of each record: lower end, median and upper end, by channel.
+        """Return, for each record, the range that contains 94 % of repeated measurements of each channel.
 
         Args:
             draws: largest number of draws that are simulated again, each with noise of its own.
             seed: seed of the noise.
+
+        Returns:
+            For each record, a table by channel: lower end, median and upper end of the range at its times, (3, T).
         """
         fewer = self._thinned(draws)
         predicted = fewer._pointwise()[1]
@@ -179,13 +193,13 @@ class Posterior:
         return tuple({name: np.stack([table[name] for table in tables]) for name in tables[0]} for tables in records)
 
     def _thinned(self, draws: int) -> "Posterior":
-        """Return about `draws` draws, equally many from each chain."""
+        """Return a posterior with at most about `draws` of the draws, equally many from each chain."""
         every = max(1, -(-self.x.shape[0] * self.x.shape[1] // draws))
         fields = {name: getattr(self, name)[:, ::every] for name in ("x", *PER_DRAW)}
         return replace(self, **fields, steps=self.steps[::every])
 
     def _pointwise(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return log likelihoods and predictions (C, draws, R) of measured values."""
+        """Return the log likelihoods and the predictions of the R measured values at each draw, both (C, draws, R)."""
         both = lambda problem, x: (problem.log_likelihoods(x), problem.predicted(x))  # noqa: E731
         one = self.problem.compiled("pointwise", lambda problem, x: jax.vmap(partial(both, problem))(x))
         parts = [jax.tree.map(np.asarray, one(x)) for x in self.x]
@@ -193,7 +207,7 @@ class Posterior:
         return np.stack(likelihoods), np.stack(predicted)
 
     def _sigma(self) -> Float[np.ndarray, "C draws R"]:
-        """Return the standard deviation of the noise of each measured value."""
+        """Return the standard deviation of the noise of each measured value at each draw."""
         problem = self.problem
         noise = np.exp(np.concatenate([self.x[..., problem.fit_problem.K :], np.zeros((*self.x.shape[:2], 1))], axis=-1))
         return problem.sigma * noise[..., problem.groups]

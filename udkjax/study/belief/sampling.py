@@ -120,7 +120,10 @@ def sample(
 
 
 def _start(density: InferenceProblem | Estimate, problem: InferenceProblem, chains: int, seed: int) -> DrawChunk:
-    """Return the mode, its covariance, and vectors that are nearly draws of the density, those of the chains first."""
+    """Return arrays by name: the mode, the covariance there, and vectors x that are nearly draws of the density.
+
+    The first of these vectors, one for each chain, are the starts of the chains.
+    """
     estimated = isinstance(density, Estimate)
     approximation = density.laplace(seed, quick=False) if estimated else approximate(problem, problem.start, seed)
     starts = approximation.starts(max(chains, STARTS), seed)
@@ -128,7 +131,7 @@ def _start(density: InferenceProblem | Estimate, problem: InferenceProblem, chai
 
 
 def _require_movement(warmup: list[DrawChunk], ended: bool) -> None:
-    """Raise an error if no chain has a density, or if none has moved when the warm-up ends."""
+    """Raise an error if no chain has reached a positive density, or if no chain has moved by the end of the warm-up."""
     if not np.isfinite(warmup[-1]["logdensity"]).any():
         cure = "give priors or bounds that keep the numbers where the mechanism runs, or a larger max_steps"
         raise IdentificationError([f"the density is zero wherever the {DRAWS} first proposals of the chains went: {cure}"])
@@ -138,7 +141,7 @@ def _require_movement(warmup: list[DrawChunk], ended: bool) -> None:
 
 
 def _fingerprint(problem: InferenceProblem) -> Mapping[str, JsonValue]:
-    """Return the inputs that determine the draws of a density."""
+    """Return the inputs that determine the draws of a density, by name, to tell whether stored draws belong to it."""
     fit, u = problem.fit_problem, problem.unknowns
     numbers = np.stack([u.guess, u.low, u.high, u.scale, u.mean, u.sigma], axis=1).tolist()
     return {

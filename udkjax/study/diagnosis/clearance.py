@@ -1,11 +1,11 @@
 """Distance from a configuration to the next one where the rank of the constraints changes.
 
-The smallest nonzero singular value, sigma, is the distance of J to the nearest matrix of lower rank. With its slope sigma_V =
-u^T (J_q V) w along the displacements V that the constraints allow, the distance along the mechanism's motion is sigma / |sigma_V|
-to first order. A mechanism with one degree of freedom, or a driven one, is also followed along its path in both directions. Where
-sigma vanishes, it has a kink; with its sign reversed beyond the kink, sigma passes through zero as smoothly as the path. The
-configuration is therefore computed as a root of a polynomial through closed positions on both sides, not close to the root, where
-closing is slow.
+The smallest nonzero singular value sigma of the scaled Jacobian J is the distance of J to the nearest matrix of lower rank. With
+its singular vectors u and w, and its slope sigma_V = u^T (J_q V) w along the displacements V that the constraints allow, the
+distance along the mechanism's motion is sigma / |sigma_V| to first order. A mechanism with one degree of freedom, or a driven
+one, is also followed along its path in both directions. Where sigma vanishes, it has a kink; with its sign reversed beyond the
+kink, sigma passes through zero as smoothly as the path. The configuration is therefore computed as a root of a polynomial through
+closed positions on both sides, not close to the root, where closing is slow.
 """
 
 from itertools import pairwise
@@ -33,7 +33,7 @@ class RankChange(NamedTuple):
 
 
 class Clearance(NamedTuple):
-    """Distance to the next rank change."""
+    """The distance to the next rank change: an estimate, and the change found on the mechanism's path, if any."""
 
     smallest: float  # the smallest nonzero singular value, relative to the largest
     estimate: float  # distance estimated from its slope, as in `RankChange`; infinite if the slope is zero
@@ -42,7 +42,14 @@ class Clearance(NamedTuple):
 
 
 def clearance(positions: RankedPositions, at: Configuration, rank: int, walk: bool = True) -> Clearance:
-    """Return the distance to the next configuration where the rank is below `rank`, the generic rank."""
+    """Return the `Clearance` of a configuration: estimates of the distance to the next one with a lower rank.
+
+    Args:
+        positions: closed positions of the mechanism.
+        at: the configuration.
+        rank: the generic rank. If the rank at the configuration is below, the distance is zero.
+        walk: True to follow a mechanism with one degree of freedom, or a driven one, along its path.
+    """
     if not rank or at.rank < rank:
         return Clearance(0.0 if rank else 1.0, 0.0 if rank else np.inf, None, 0.0)
     sigma = at.value(rank)
@@ -59,7 +66,10 @@ def _slope(positions: RankedPositions, at: Configuration, direction: np.ndarray,
 
 
 def _search(positions: RankedPositions, start: Configuration, rank: int) -> tuple[RankChange | None, float]:
-    """Return the nearest rank change on the path, and the length of path searched."""
+    """Return the nearest rank change on the path through `start`, and the length of the path searched in the longer direction.
+
+    The rank change is None if none was found.
+    """
     onward, around = _walk(positions, start, rank, 1.0)
     back = [] if around else _walk(positions, start, rank, -1.0)[0]
     path = [*reversed(back), start, *onward]
@@ -76,7 +86,10 @@ def _search(positions: RankedPositions, start: Configuration, rank: int) -> tupl
 
 
 def _walk(positions: RankedPositions, start: Configuration, rank: int, side: float) -> tuple[list[Configuration], bool]:
-    """Return closed positions along the path, past the first minimum of sigma, and True if they return to the start."""
+    """Return closed positions along the path, up to just after the first minimum of sigma, and True if they return to the start.
+
+    `side` is 1 or -1, the direction along the path.
+    """
     path, more = [start], WALK_STEPS
     heading = side * start.right[:, 0] if start.freedom else np.zeros(len(start.q))
     while more:
@@ -103,7 +116,7 @@ def _onward(places: list[np.ndarray]) -> np.ndarray:
 
 
 def _has_kink(sigma: list[float]) -> bool:
-    """Return True if three values have a minimum that may be zero: at most as large as the rise to one of its neighbours."""
+    """Return True if three successive values have a minimum that may be zero: at most as large as the rise to a neighbour."""
     return sigma[1] <= min(sigma[0], sigma[2]) and sigma[1] <= max(sigma[0], sigma[2]) - sigma[1]
 
 
@@ -115,7 +128,10 @@ def _step(positions: RankedPositions, at: Configuration, heading: np.ndarray, st
 def _root(
     positions: RankedPositions, path: list, distances: np.ndarray, sigma: np.ndarray, k: int, rank: int
 ) -> RankChange | None:
-    """Return the configuration near the k-th position where sigma vanishes, if there is one."""
+    """Return the rank change near the k-th position of a path, if sigma vanishes there; otherwise None.
+
+    `distances` are the lengths along the path, and `sigma` the values of the `rank`-th singular value, at its positions.
+    """
     if not _has_kink(sigma[k - 1 : k + 2].tolist()):
         return None
     near = slice(max(0, k - POINTS_PER_SIDE), k + POINTS_PER_SIDE + 1)

@@ -1,7 +1,7 @@
 """A closed position of a mechanism, its scaled Jacobian with null spaces, and nearby closed positions.
 
-All of this is NumPy on the scene's programs, without compilation. Rows and columns are scaled as in determinacy.py. In large
-scenes the Jacobian is sparse, and only its small singular values are computed.
+NumPy computes all of this from the scene's programs, without compilation. Rows and columns are scaled as in determinacy.py. In
+large scenes the Jacobian is sparse, and only its small singular values are computed.
 """
 
 from collections.abc import Sequence
@@ -50,7 +50,10 @@ class Configuration:
         return count_rank(self.sigma, self._rank_tol)
 
     def value(self, number: int) -> float:
-        """Return the `number`-th largest singular value, from one; `number` is at least the rank."""
+        """Return the `number`-th largest singular value, counted from one; `number` must be at least the rank.
+
+        A `LargeConfiguration` only knows the singular values from there on.
+        """
         return float(self.sigma[number - 1])
 
     @property
@@ -104,7 +107,7 @@ class Configuration:
 
     @property
     def smallest(self) -> float:
-        """The smallest nonzero singular value, relative to the largest."""
+        """The smallest nonzero singular value, relative to the largest; 1 if the rank is zero."""
         return self.value(self.rank) / self.largest if self.rank else 1.0
 
 
@@ -115,7 +118,7 @@ class LargeConfiguration(Configuration):
         t: time (s).
         q: coordinates (n,).
         J: scaled Jacobian (m, n), in compressed sparse rows.
-        small: its small singular values.
+        small: the small singular values of J.
         rank_tol: singular values up to this fraction of the largest count as zero.
     """
 
@@ -150,7 +153,14 @@ class LargeConfiguration(Configuration):
 
 
 class RankedPositions:
-    """Closed positions of a mechanism with concrete numbers."""
+    """The closed positions of a mechanism with concrete numbers, each as a `Configuration` with the rank of its scaled Jacobian.
+
+    Attributes:
+        rows: the rows of the mechanism.
+        rank_tol: singular values up to this fraction of the largest count as zero.
+        unit: scale of each coordinate: coordinates are divided by it.
+        row_unit: scale of each row of Psi: rows are divided by it.
+    """
 
     def __init__(self, mechanism: Mechanism, rank_tol: float):
         rows = self.rows = KinematicRows(mechanism)
@@ -164,7 +174,7 @@ class RankedPositions:
             self.unit, self.row_unit = self.unit * rows.balance.coordinates, self.row_unit * rows.balance.rows
 
     def at(self, t: float, q: np.ndarray) -> Configuration:
-        """Return the configuration at closed coordinates."""
+        """Return the configuration at closed coordinates q (n,) and time t (s)."""
         if not self._is_large:
             return Configuration(t, q, self._dense_jacobian(t, q), self.rank_tol)
         from udkjax.pinv.sparse_gram import SmallSingularValues  # imports SciPy, which small scenes do not need
@@ -181,7 +191,7 @@ class RankedPositions:
         return jacobian(at.t, at.q + step) - jacobian(at.t, at.q - step)
 
     def rank_of_rows(self, at: Configuration, rows: Sequence[int]) -> int:
-        """Return the rank of some of the rows of J."""
+        """Return the rank of some of the rows of J, which are given by their indices."""
         if len(rows) == at.shape[0]:
             return at.rank
         return count_rank(singular_values(at.J[rows]), self.rank_tol)
@@ -202,7 +212,7 @@ class RankedPositions:
 
     @cached_property
     def _by_elimination(self) -> KinematicRows | None:
-        """The rows without those that `analyse` leaves out; None in large scenes, and if it does not know which."""
+        """The rows without the redundant ones that `analyse` finds; None in large scenes, or if `analyse` does not know these."""
         redundant = None if self._is_large else analyse(self._mechanism).redundant_rows
         if redundant is None:
             return None
@@ -211,9 +221,10 @@ class RankedPositions:
         return rows
 
     def near(self, t: float, q: np.ndarray) -> Configuration | None:
-        """Return the closed position nearest to q; None if none is found.
+        """Return the closed position nearest to coordinates q (n,) at time t (s); None if none is found.
 
-        The rows that are left out hold where the others do, unless branches meet: there all rows are closed together.
+        First the independent rows are closed: then the redundant ones hold, too, unless branches of the motion meet there. If
+        they do not hold, all rows are closed together.
         """
         if not self.rows.count:
             return self.at(t, q)
@@ -225,11 +236,21 @@ class RankedPositions:
         return None
 
     def displace(self, start: Configuration, direction: np.ndarray, step: float, t: float | None = None) -> Configuration | None:
-        """Displace `start` by a step along a direction in scaled coordinates; return the nearest closed position, if any."""
+        """Return the closed position nearest to `start` plus a step; None if none is found.
+
+        Args:
+            start: the configuration to start from.
+            direction: direction of the step in scaled coordinates (n,).
+            step: length of the step, relative to the direction's.
+            t: time (s) of the closed position; by default that of `start`.
+        """
         return self.near(start.t if t is None else t, start.q + step * self.unit * direction)
 
     def distance(self, first: Configuration, second: Configuration, turns: bool = True) -> float:
-        """Return the distance of two positions: the norm of the scaled displacement; whole turns count only with `turns`."""
+        """Return the distance between two positions, the norm of the scaled displacement.
+
+        With `turns`, angles that differ by whole turns are different; without, they are the same.
+        """
         displacement = (second.q - first.q) / self.unit
         if not turns:
             displacement[2::3] = np.remainder(displacement[2::3] + np.pi, 2 * np.pi) - np.pi
@@ -255,7 +276,7 @@ class RankedPositions:
 
 
 class JointForces(NamedTuple):
-    """Uniqueness of the multipliers of a constraint."""
+    """Uniqueness of the multipliers of a constraint, by its rows of N, an orthonormal basis of the left null space of J."""
 
     unique: tuple[bool, ...]  # for each row
     share: tuple[float, ...]  # norm of each row of N: from 0 (unique) to 1 (arbitrary)

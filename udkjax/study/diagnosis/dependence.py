@@ -27,7 +27,7 @@ class Dependency(NamedTuple):
 
 
 def dependencies(N: np.ndarray, owners: Sequence[str], attached: dict[str, tuple[str, ...]]) -> list[Dependency]:
-    """Return minimal dependent sets whose combinations span N (m, k), the smallest sets first.
+    """Return minimal sets of dependent constraints whose vanishing combinations span N (m, k), the smallest sets first.
 
     `owners` is the constraint of each row, `attached` the bodies of each constraint; sets of neighbouring constraints are
     preferred.
@@ -58,7 +58,10 @@ def dependencies(N: np.ndarray, owners: Sequence[str], attached: dict[str, tuple
 def dependencies_at(
     attached: dict[str, tuple[str, ...]], here: Configuration, generic: Sequence[Configuration], owners: Sequence[str]
 ) -> tuple[list[Dependency], list[Dependency]]:
-    """Return the sets of constraints that are dependent in all generic configurations, and those dependent in `here` only."""
+    """Return the sets of constraints that are dependent in all generic configurations, and those dependent in `here` only.
+
+    `owners` is the constraint of each row, and `attached` the bodies of each constraint.
+    """
     best = max(generic, key=lambda c: c.smallest)
     permanent = dependencies(best.left, owners, attached)
     if here.rank == best.rank:
@@ -80,7 +83,10 @@ def stress_of(N: np.ndarray, owners: Sequence[str], members: Iterable[str]) -> n
 def _minimal_set_around(
     seed: str, involved: list[str], N: np.ndarray, owner: np.ndarray, attached: dict[str, tuple[str, ...]]
 ) -> list[str]:
-    """Return a minimal dependent set around a constraint: all others are removed if possible, the farthest first."""
+    """Return a minimal dependent set around the constraint `seed`.
+
+    Constraints of `involved` are removed from the set if possible, the farthest first.
+    """
     far, members = _distances(seed, involved, attached), list(involved)
     left = N @ null_space(N[~np.isin(owner, involved)], DEPENDS).T  # combinations that vanish outside of the members
     for name in sorted(involved, key=lambda name: -far[name]):
@@ -92,7 +98,10 @@ def _minimal_set_around(
 
 
 def _distances(seed: str, names: list[str], attached: dict[str, tuple[str, ...]]) -> dict[str, int]:
-    """Return the number of bodies between one constraint and each of the others."""
+    """Return the number of bodies between the constraint `seed` and each of the constraints in `names`, by name.
+
+    Constraints that no bodies connect to `seed` have the distance `len(names)`.
+    """
     far, edge = {seed: 0}, [seed]
     while edge:
         reached = {body for name in edge for body in attached[name]}

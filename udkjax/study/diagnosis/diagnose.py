@@ -139,14 +139,17 @@ def attached_bodies(mechanism: Mechanism) -> dict[str, tuple[str, ...]]:
 
 
 def _with_fixes(search: FixSearch, sets: list[Dependency]) -> list[Redundancy]:
-    """Return permanently dependent sets with the fixes that help in all generic positions."""
+    """Return the `Redundancy` of each permanently dependent set, with the fixes that help in all generic positions."""
     return [Redundancy(x.constraints, x.redundancy, True, tuple(search.fixes_of(x))) for x in sets]
 
 
 def _cure(
     search: FixSearch, found: list[Redundancy], positions: RankedPositions, generic: list[Configuration]
 ) -> tuple[Fix, ...]:
-    """Return the best fixes in sequence, each determined after applying the previous one, until nothing is redundant."""
+    """Return the best fixes in sequence, each determined after applying the previous one, until nothing is redundant.
+
+    The sequence is empty if nothing is redundant, or if the fixes found do not remove all redundancy.
+    """
     done: list[Fix] = []
     of_first = [r.fixes[0] for r in found if r.permanent and r.fixes]
     best = max(of_first, key=lambda fix: (fix.removes, fix.conditioning), default=None)
@@ -161,14 +164,20 @@ def _cure(
 
 
 def _search_after(fix: Fix, positions: RankedPositions, generic: list[Configuration]) -> FixSearch:
-    """Return the search after the fix of a held pin, which the search by the null space does not know."""
+    """Return a search for further fixes in the mechanism after `fix`, which makes a held pin a prismatic joint.
+
+    `FixSearch.after` does not know the fixes of held pins.
+    """
     ranked = RankedPositions(fix.mechanism, positions.rank_tol)
     owners = [name for name, _ in ranked.rows.names]
     return FixSearch(fix.mechanism, ranked, [ranked.at(c.t, c.q) for c in generic], owners, ranked.row_unit)
 
 
 def _forces(mechanism: Mechanism, here: Configuration, owners: list[str]) -> dict[str, JointForces]:
-    """Return which multipliers are unique, from N, and for a pin the only direction in which the force is unique, if any."""
+    """Return the `JointForces` of each constraint, by name: uniqueness of its multipliers in the configuration `here`.
+
+    `owners` is the constraint of each row of J.
+    """
     forces = {}
     for name, element in mechanism.constraints.items():
         indices = [k for k, owner in enumerate(owners) if owner == name]
@@ -182,7 +191,7 @@ def _forces(mechanism: Mechanism, here: Configuration, owners: list[str]) -> dic
 
 
 def _at_rest(closure: Closure) -> Closure:
-    """Return a closure that is closed if its positions are."""
+    """Return a closure without velocity errors, whose `is_closed` depends on its positions alone."""
     psi, q, v = np.asarray(closure.psi), np.ravel(closure.state.q), np.ravel(closure.state.v)
     shut = is_closed(closure.scales, q, v, psi, np.zeros_like(psi), np)
     return closure._replace(psi_dot=0.0 * closure.psi_dot, is_closed=shut)

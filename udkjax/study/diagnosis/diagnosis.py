@@ -33,7 +33,7 @@ class Diagnosis(NamedTuple):
         branches: motions that meet in a singular configuration.
         forces: for each constraint, which components of its forces are unique.
         clearance: distance to the next rank change.
-        timeline: rank and singular values along a solution; None without one.
+        timeline: rank and singular values along a solution; None if no solution was given.
     """
 
     mechanism: Mechanism
@@ -185,7 +185,10 @@ def _redundancy(r: Redundancy, has_cure: bool) -> list[str]:
 
 
 def _redundancies(result: Diagnosis) -> list[str]:
-    """Describe each set in full, or, if there are many, in a line each, with a title for those of the same kind."""
+    """Return lines on the redundant sets: all numbers of each set, or, if there are many sets, one line each.
+
+    In the latter case, sets of the same kind share a title.
+    """
     sets, has_cure = result.redundancies, bool(result.cure)
     if len(sets) <= MOST_SETS_IN_FULL:
         return [line for r in sets for line in _redundancy(r, has_cure)]
@@ -223,7 +226,10 @@ def _either(names: list[str]) -> str:
 
 
 def _cure(result: Diagnosis) -> list[str]:
-    """Name the changes that remove all redundancy; those of the same kind share a line."""
+    """Return lines with the changes that together remove all redundancy, or no lines if there are fewer than two changes.
+
+    Constraints with the same change share a line.
+    """
     if len(result.cure) < 2:
         return []
     kinds: dict[str, list[str]] = {}
@@ -262,7 +268,7 @@ def _branches(result: Diagnosis) -> list[str]:
 
 
 def _forces(result: Diagnosis) -> list[str]:
-    """Name the multipliers that are not unique; constraints with the same direction share a line."""
+    """Return lines with the multipliers that are not unique; constraints with the same unique direction share a line."""
     groups: dict[str, list[str]] = {}
     for name, forces in result.forces.items():
         if all(forces.unique):
@@ -277,7 +283,7 @@ def _forces(result: Diagnosis) -> list[str]:
 
 
 def _friction(result: Diagnosis) -> list[str]:
-    """Name the joints whose friction depends on a load that is not unique."""
+    """Return a line on the uniqueness of the joint loads on which friction depends; no line if there is no such friction."""
     loose = [joint for joint, friction in result.friction.items() if not friction.load]
     if not loose:
         return ["all loads are unique, and so are the accelerations"] if result.friction else []

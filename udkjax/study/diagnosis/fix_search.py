@@ -1,4 +1,6 @@
-"""The search for changes that remove redundancy: by the left null space of the Jacobian, then verified on the changed constraint.
+"""The search for changes of constraints that remove redundancy.
+
+Candidates follow from the left null space of the Jacobian; each is then verified with the rows of the changed constraint.
 
 With N a basis of the left null space of J and C the rows that a change of a constraint removes, as combinations of the
 constraint's own rows, the change preserves the rank if C N has as many independent rows as C; it then removes as many redundant
@@ -26,7 +28,7 @@ DIGITS = 6  # by which measures of fixes are compared: further ones are rounding
 
 
 class FixSearch:
-    """Changes of the constraints of a mechanism that help in all generic configurations; each is verified once.
+    """A search for changes of constraints that remove redundancy in all generic configurations; each is verified once.
 
     Args:
         mechanism: mechanism.
@@ -55,7 +57,10 @@ class FixSearch:
         return sorted((x[0] for x in found if x), key=lambda fix: (-fix.removes, -_comparable(fix.conditioning)))
 
     def best(self, sets: Sequence[Dependency]) -> "tuple[Fix, FixSearch] | None":
-        """Return the best fix of all sets and the search after it, or None. Candidates are verified one by one."""
+        """Return the best fix of all sets, and the search in the mechanism after it; None if no fix helps.
+
+        Candidates are verified one after another, the most promising first.
+        """
         options = []
         for dependency in sets:
             for name in dependency.constraints:
@@ -67,7 +72,7 @@ class FixSearch:
         return next((x for x in found if x), None)
 
     def after(self, fix: Fix) -> "FixSearch | None":
-        """Return the search in the mechanism after one further fix."""
+        """Return the search in the mechanism after a fix; None if this search has not verified the fix."""
         found = self._verified.get((fix.constraint, fix.change))
         return found[1] if found else None
 
@@ -79,9 +84,10 @@ class FixSearch:
         return [k for k, owner in enumerate(self.owners) if owner == name]
 
     def _helpful_changes(self, name: str, dependency: Dependency) -> Iterator[tuple[int, float, JointChange]]:
-        """Iterate over the changes of a constraint that preserve the rank, the best first: removed rows, conditioning, change.
+        """Iterate over the changes of a constraint that preserve the rank, the best first.
 
-        The changes of a constraint that remove fewer rows are only looked at if those that remove more do not help.
+        Each comes with the number of rows that it removes, and the conditioning after it, in this order: (rows, conditioning,
+        change). Changes that remove fewer rows are only examined if those that remove more do not help.
         """
         indices, places = self._rows_of(name), body_indices(self.mechanism, name)
         forces = lru_cache(lambda k: self._forces(self.at[k], indices, dependency))
@@ -98,7 +104,7 @@ class FixSearch:
                 yield count, conditioning, change
 
     def _forces(self, at: Configuration, indices: list[int], dependency: Dependency) -> np.ndarray:
-        """Return the multipliers of a constraint in the states of self-stress of a set."""
+        """Return the multipliers (rows, redundancy) of a constraint's rows in the states of self-stress of a set."""
         key = id(at), dependency
         if key not in self._stresses:
             self._stresses[key] = stress_of(at.left, self.owners, dependency.constraints)
@@ -118,7 +124,11 @@ class FixSearch:
                 yield found
 
     def _verify(self, name: str, removes: int, change: JointChange) -> "tuple[Fix, FixSearch] | None":
-        """Return a fix and the search after it; None if the change affects the mechanism differently than its Jacobian."""
+        """Return a fix and the search after it; None if the change has another effect than the Jacobian predicts.
+
+        That is so if another element needs the constraint, or if in a generic configuration the changed constraint is not closed,
+        the rank or the number of redundant rows is not the expected one, or the conditioning becomes poor.
+        """
         changed = apply_change(self.mechanism, name, change)
         if changed is None:
             return None
@@ -146,7 +156,7 @@ class FixSearch:
 
 
 class _ElementRows:
-    """Psi of one element, and its rows of Psi_q."""
+    """Psi of one constraint, and its rows of Psi_q (., n), as a function of a configuration; both empty for no constraint."""
 
     def __init__(self, mechanism: Mechanism, element: Constraint | None):
         self._alone = None
@@ -165,7 +175,7 @@ class _ElementRows:
 
 
 class _Changed(Configuration):
-    """A configuration after a change, with a guess of its left null space: it saves a decomposition if it is right."""
+    """A configuration after a change, with a guess of its left null space, which saves a decomposition if it is right."""
 
     def __init__(self, t: float, q: np.ndarray, J: np.ndarray, rank_tol: float, guess: np.ndarray):
         super().__init__(t, q, J, rank_tol)
@@ -178,7 +188,10 @@ class _Changed(Configuration):
 
 
 def _preserves_rank(removed: np.ndarray, N: np.ndarray) -> bool:
-    """Return True if rows that are removed depend on the others, by the rows N of their constraint in the null space."""
+    """Return True if the rank stays the same without the rows `removed`, which are combinations (., rows) of a constraint's rows.
+
+    N has the constraint's rows (rows, k) of the basis of the left null space: the rank stays if `removed` N has independent rows.
+    """
     part = removed @ N
     return part.shape[0] <= part.shape[1] and bool(np.all(np.linalg.svd(part, compute_uv=False) > DEPENDS))
 

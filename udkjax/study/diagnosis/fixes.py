@@ -27,7 +27,10 @@ class JointChange(NamedTuple):
     rows: tuple[int, ...] = ()  # remaining rows, if the change is not a slot
 
     def remaining_rows(self, rows: np.ndarray, q: np.ndarray, places: list[int | None]) -> np.ndarray:
-        """Return the remaining rows of the constraint's Jacobian."""
+        """Return the rows of the constraint's Jacobian that remain of `rows`, those before the change.
+
+        `q` are the coordinates (n,), and `places` the indices of the constraint's bodies (`body_indices`).
+        """
         if self.slides is None:
             return rows[list(self.rows)]
         cos, sin = self._direction(q, places)
@@ -46,7 +49,7 @@ class JointChange(NamedTuple):
         return float(np.linalg.norm(self._direction(q, places) @ force[:2]) / np.linalg.norm(force[:2], 2))
 
     def _direction(self, q: np.ndarray, places: list[int | None]) -> np.ndarray:
-        """Return the direction of the slot in ground axes."""
+        """Return the direction of the slot in ground axes, a unit vector."""
         body, axis = self.slides or (0, 0.0)
         index = places[body]
         angle = axis + (0.0 if index is None else q[3 * index + 2])
@@ -70,13 +73,16 @@ class Redundancy(NamedTuple):
     count: int  # number of their redundant rows
     permanent: bool  # True if dependent in every position, False if in this configuration only
     fixes: tuple[Fix, ...]  # verified changes; empty if not permanent
-    held: tuple[str, ...] = ()  # pins among them that they hold to second order only
+    held: tuple[str, ...] = ()  # pins among the constraints whose angles the set holds to second order only
 
 
 def fix_of_held_pin(
     mechanism: Mechanism, positions: RankedPositions, at: Configuration, name: str, joint: Prismatic
 ) -> Fix | None:
-    """Return the change of a pin that does not turn to a prismatic joint; None if it does not help."""
+    """Return the fix that replaces a pin, which does not turn, by a prismatic joint; None if this does not help.
+
+    It helps if it removes redundant rows and raises the rank.
+    """
     axis = _half_turn(float(joint.axis))
     text = f'make it a prismatic joint along {np.rad2deg(axis):.4g} degrees of the frame of "{joint.bodies[0]}": it does not turn'
     changed = apply_change(mechanism, name, JointChange(text, lambda: Prismatic(joint.bodies, joint.points, axis, joint.angle)))
@@ -102,7 +108,7 @@ def apply_change(mechanism: Mechanism, name: str, change: JointChange) -> Mechan
 
 
 def body_indices(mechanism: Mechanism, name: str) -> list[int | None]:
-    """Return the indices of a constraint's bodies; None for the ground."""
+    """Return the indices of a constraint's bodies among those of the mechanism; None for the ground."""
     bodies = mechanism.frames_of(mechanism.constraints[name])
     return [None if body == GROUND else mechanism.body_names.index(body) for body in bodies]
 
@@ -110,7 +116,7 @@ def body_indices(mechanism: Mechanism, name: str) -> list[int | None]:
 def changes_of(mechanism: Mechanism, name: str, at: Configuration, force: Callable[[], np.ndarray]) -> Iterator[JointChange]:
     """Iterate over the ways to relax a constraint, those that remove more rows first.
 
-    `force` returns its multipliers (rows, redundancy) in the states of self-stress.
+    `force` returns the constraint's multipliers (rows, redundancy) in the states of self-stress.
     """
     element = mechanism.constraints[name]
     yield JointChange("remove it", None)
@@ -132,12 +138,12 @@ def changes_of(mechanism: Mechanism, name: str, at: Configuration, force: Callab
 
 
 def _slot(pin: Revolute, k: int, axis: float) -> Slot:
-    """Return the slot along an axis of body k of a pin."""
+    """Return the slot along an axis (rad) in body k of a pin, in which the pin's point of the other body slides."""
     return Slot((pin.bodies[k], pin.bodies[1 - k]), (pin.points[k], pin.points[1 - k]), axis=axis)
 
 
 def _half_turn(angle: float) -> float:
-    """Return the direction of the same line in (-90, 90] degrees, without rounding errors of multiples of 90 degrees."""
+    """Return the angle (rad) of the same line in (-pi/2, pi/2], without rounding errors of multiples of 90 degrees."""
     angle = float(np.remainder(angle + np.pi / 2, np.pi) - np.pi / 2)
     near = round(angle / (np.pi / 2)) * np.pi / 2
     angle = near if abs(angle - near) < 1e-9 else angle

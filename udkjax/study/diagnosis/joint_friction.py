@@ -10,7 +10,12 @@ from udkjax.equations.states.textbook import TextbookEquations
 
 
 class JointFriction(NamedTuple):
-    """Marks of uniqueness: of the load on which the friction of a joint depends, and of the accelerations that it causes."""
+    """The uniqueness of a joint's friction.
+
+    Attributes:
+        load: True if the load of the joint on which the friction depends is unique.
+        accelerations: True if the accelerations that the friction causes are unique.
+    """
 
     load: bool
     accelerations: bool
@@ -19,9 +24,9 @@ class JointFriction(NamedTuple):
 def joint_friction(
     equations: TextbookEquations, t: float, q: Float[ArrayLike, "n"], N: Float[ArrayLike, "m k"]
 ) -> dict[str, JointFriction]:
-    """Return for friction that depends on loads whether these, and the accelerations that it causes, are unique, by joint.
+    """Return the uniqueness of the friction in each joint whose friction depends on the load of the joint, by name.
 
-    Accelerations are those of a motion that slides in all joints that can.
+    Accelerations are those of a motion in which all joints slide that can slide.
 
     Args:
         equations: The equations of the mechanism.

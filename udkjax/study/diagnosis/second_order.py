@@ -1,8 +1,9 @@
 """The branches that meet at a singular configuration, as directions that the constraints allow to second order.
 
-Along a curve q(s) with q' = V x, where V spans the null space of J, Psi = 0 requires J q'' = -H(V x, V x). This has a solution if
-and only if N^T H(V x, V x) = 0: one quadratic form x^T A_i x for each column of N. The common zeros of the forms are the tangents
-of the branches, computed by the Gauss-Newton method from many directions at once. A step along each tangent verifies a motion.
+Let V span the null space of the Jacobian J of Psi, let N span that of J^T, and let H be the second derivative of Psi. Along a
+curve q(s) with q' = V x, Psi = 0 requires J q'' = -H(V x, V x). This has a solution if and only if N^T H(V x, V x) = 0: one
+quadratic form x^T A_i x for each column of N. The common zeros of the forms are the tangents of the branches, computed by the
+Gauss-Newton method from many directions at once. A step along each tangent verifies a motion.
 """
 
 from typing import NamedTuple
@@ -45,7 +46,7 @@ def branches(mechanism: Mechanism, positions: RankedPositions, at: Configuration
 
 
 def quadratic_forms(mechanism: Mechanism, positions: RankedPositions, at: Configuration) -> np.ndarray:
-    """Return the forms A (k, d, d) of the second-order condition: N^T of the second derivative of scaled Psi along V."""
+    """Return the forms A (k, d, d) of the second-order condition: N^T times the second derivative of scaled Psi along V."""
     if not at.redundancy or not at.freedom:
         return np.zeros((at.redundancy, at.freedom, at.freedom))
     N, V = at.left, at.right
@@ -90,7 +91,7 @@ def zeros_of(A: np.ndarray) -> list[Zeros]:
 
 
 def _solve(A: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Return zeros on the unit sphere, by Gauss-Newton from many directions x (s, d)."""
+    """Return common zeros of the forms on the unit sphere, found by Gauss-Newton from many directions x (s, d)."""
     x = x / np.linalg.norm(x, axis=1, keepdims=True)
     for _ in range(GAUSS_NEWTON_STEPS):
         residual = np.einsum("kij,si,sj->sk", A, x, x)
@@ -101,7 +102,10 @@ def _solve(A: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 
 def _zeros_around(A: np.ndarray, x: np.ndarray) -> Zeros:
-    """Return the zeros around x: the null space of all A_i x if all forms vanish on it, a cone if zeros are near, or x."""
+    """Return the zeros around a zero x of all forms.
+
+    These are the common null space of all A_i x if the forms vanish on it; a line of a cone if other zeros are near; or x alone.
+    """
     sigma, vt = np.linalg.svd(2 * np.einsum("kij,j->ki", A, x))[1:]
     kernel = vt[int(np.sum(sigma > SAME_DIRECTION)) :].T
     if kernel.shape[1] > 1:

@@ -25,7 +25,7 @@ class RowSet(NamedTuple):
 
     rows: tuple[str, ...]
     count: int  # number of its redundant rows
-    permanent: bool  # whether it is dependent nearby, too
+    permanent: bool  # True if the set is dependent in nearby states, too
 
 
 class SystemDiagnosis(NamedTuple):
@@ -39,9 +39,9 @@ class SystemDiagnosis(NamedTuple):
         position_rank: rank of Psi_q alone in this state.
         redundancies: minimal sets of dependent rows.
         redundant: rows that can be left out together without any effect.
-        unique: for each row, whether its multiplier is unique.
+        unique: by row, True if its multiplier is unique.
         singular_values: singular values of J, largest first.
-        timeline: rank and singular values along a solution; None without one.
+        timeline: rank and singular values along a solution; None if no solution was given.
     """
 
     t: float  # s
@@ -51,7 +51,7 @@ class SystemDiagnosis(NamedTuple):
     rank: int
     ordinary_rank: int
     position_rank: int
-    can_move: bool  # whether closed states nearby were found
+    can_move: bool  # True if closed states nearby were found
     redundancies: tuple[RowSet, ...]
     redundant: tuple[str, ...]
     unique: dict[str, bool]
@@ -70,7 +70,10 @@ class SystemDiagnosis(NamedTuple):
 
     @property
     def position_freedoms(self) -> int:
-        """Number of independent changes of coordinates, n minus the rank of Psi_q: more, if phi is nonholonomic."""
+        """Number of independent changes of coordinates, n minus the rank of Psi_q.
+
+        If phi is nonholonomic, it exceeds `degrees_of_freedom`.
+        """
         return self.coordinates - self.position_rank
 
     @property
@@ -89,7 +92,7 @@ class SystemDiagnosis(NamedTuple):
         return plain(self) | {name: plain(getattr(self, name)) for name in further}
 
     def _sections(self) -> list[tuple[str, str]]:
-        """Return titles and lines of text."""
+        """Return the lines of the text, each with a title, which is empty in continuation lines."""
         n, loose = self.coordinates, [name for name, is_unique in self.unique.items() if not is_unique]
         freedoms = plural(self.degrees_of_freedom, "degree")
         lines = [("mobility", f"{n} coordinates - rank {self.ordinary_rank} = {freedoms} of freedom")]
@@ -129,7 +132,14 @@ def diagnose_system(
     solution: StateHistory | None,
     time_tol: float | None,
 ) -> SystemDiagnosis:
-    """Diagnose a system in the closed state near a given one, or near its own guess."""
+    """Return the diagnosis of a system in the closed state near `state`, or, if it is None, near the system's own guess.
+
+    The other arguments are those of `diagnose`.
+
+    Raises:
+        AssemblyError: the state cannot be closed.
+        ValueError: float64 is off in JAX.
+    """
     if not jax.config.jax_enable_x64:
         raise ValueError("the rank of a ConstrainedSystem needs float64, which is off in JAX: leave JAX_ENABLE_X64 unset")
     closure = close(system, t, state)
@@ -175,7 +185,7 @@ def _configuration(system: Any, t: float, q: np.ndarray, v: np.ndarray, rank_tol
 def _neighbours(
     system: ConstrainedSystem, traced: Any, start: Configuration, v: np.ndarray, rank_tol: float
 ) -> list[Configuration]:
-    """Return closed states along a random motion from a state."""
+    """Return closed states along a random motion from the state `start` with velocities v; `traced` is the traced system."""
     random, found, last = np.random.default_rng(0), [], start
     for _ in range(N_NEIGHBOURS if len(start.J) else 0):
         allowed = last.allowed(random.standard_normal(len(start.q)))

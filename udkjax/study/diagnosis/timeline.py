@@ -46,14 +46,14 @@ class TimedRankChange(NamedTuple):
 
 
 class Timeline(NamedTuple):
-    """Singular values of the scaled Jacobian along a trajectory, and rank changes."""
+    """Singular values and rank of the scaled Jacobian at the output times of a trajectory, and rank changes between them."""
 
     ts: Float[np.ndarray, "T"]
     singular_values: Float[np.ndarray, "T k"]
     rank: Int[np.ndarray, "T"]
     changes: tuple[TimedRankChange, ...]
     closest: tuple[float, float]  # time (s) and value of the minimum of `smallest` over all samples
-    unit: str = "s"  # of the times; that of the values along a `Kinematics` over the values of a driver
+    unit: str = "s"  # unit of `ts`; of the values of a driver if the trajectory is a `Kinematics` over these
 
     @property
     def smallest(self) -> Float[np.ndarray, "T"]:
@@ -120,7 +120,10 @@ def _kinks(sigma: np.ndarray) -> list[int]:
 
 
 def _locate(path: "_Path", low: float, high: float, rank: int, rank_tol: float, tol: float) -> TimedRankChange | None:
-    """Return the minimum of a singular value in a bracket, or None if the rank does not change in it."""
+    """Return the rank change between the times `low` and `high`; None if the rank does not change there.
+
+    The time of the change is that at which the singular value number `rank`, the generic rank, is least.
+    """
     start, end, at, values = low, high, low, np.zeros(0)
     while True:
         grid = np.linspace(low, high, PARTS_OF_BRACKET + 1)
@@ -141,9 +144,9 @@ def _locate(path: "_Path", low: float, high: float, rank: int, rank_tol: float, 
 def _renew(
     mechanism: StudyModel, analysis: Analysis | None, solution: StateHistory, ts: np.ndarray, low: float, high: float
 ) -> "_Path | None":
-    """Integrate the trajectory between two times again, starting from the output time before these.
+    """Integrate the trajectory between two times again, starting from the output time before `low`.
 
-    Return None for other trajectories than runs without events: a new run would have none.
+    Return None if the trajectory is not a run without events, since a new run would have no events; or if the new run fails.
     """
     if not isinstance(solution, Solution) or solution.events is not None:
         return None
@@ -157,7 +160,7 @@ def _renew(
 
 
 class _Path:
-    """Singular values at any time, by quintics through q, v and a of neighbouring states; else by cubics through q and v."""
+    """A trajectory at any time, with its singular values: quintics through q, v and a of states, or cubics through q and v."""
 
     def __init__(
         self, mechanism: StudyModel, analysis: Analysis | None, ts: np.ndarray, q: np.ndarray, v: np.ndarray, by_a: bool = True

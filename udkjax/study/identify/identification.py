@@ -120,7 +120,11 @@ MOST_STARTS = 10**6  # largest number of first guesses; more would not fit into 
 
 
 def _first_guesses(problem: FitProblem, n_starts: int, guesses: Numbers | None) -> Float[np.ndarray, "B K"]:
-    """Return first guesses of all unknowns; those of initial states are zero."""
+    """Return the first guesses z of all unknowns: zero, then the given `guesses` of parameters with initial states of zero.
+
+    Raises:
+        IdentificationError: `n_starts` is out of range, or `guesses` are not values of the parameters.
+    """
     first, P = np.zeros((1, problem.K)), len(problem.unknowns.names)
     if not 0 <= n_starts <= MOST_STARTS:
         raise IdentificationError([f"n_starts: must be a number of guesses between 0 and {MOST_STARTS:,}, not {n_starts}"])
@@ -148,7 +152,10 @@ def _require_finite(problem: FitProblem, result: SearchResult) -> None:
 
 
 def _refit(result: SearchResult, tol: TolerancePair, minimizer: Minimizer) -> tuple[Fit, CostHistory]:
-    """Fit to the final tolerance, each channel weighted by the noise estimated from its residuals."""
+    """Fit to the final tolerance, each channel weighted by the noise estimated from its residuals.
+
+    Return the fit, and the cost history of the search and of all fits here.
+    """
     problem = result.problem
     fit = minimizer.minimize(problem, result.fit.z, tol)
     history = [*result.history, *fit.history]
@@ -166,7 +173,7 @@ def reweigh(problem: FitProblem, z: Float[np.ndarray, "K"], tol: TolerancePair, 
     """Set the noise of channels without given noise from their residuals, but to at least `least` times the channel's scale.
 
     Returns:
-        True if the relative weights of residuals changed, so that another fit is needed.
+        True if another fit is needed: the relative weights of residuals changed, the loss is robust, or there are priors.
     """
     old_sigma = problem.sigma.copy()
     rows = len(problem.index)
@@ -261,5 +268,5 @@ def _estimate_of(
 
 
 def _without_slopes(r: Float[np.ndarray, "R"]) -> Residuals:
-    """Return residuals without unknowns."""
+    """Return residuals of a single set of unknowns whose Jacobian has no columns."""
     return Residuals(r[None], np.zeros((1, len(r), 0)), np.zeros(1, int))

@@ -147,7 +147,10 @@ class Dimension:
 
 
 def labels_of(setting: str, choices: Sequence[AxisChoice], replaced: Collection[str] = ()) -> tuple[str, ...]:
-    """Return readable, unique names of choices: the types, with numbers, except `replaced` ones, if types are equal."""
+    """Return readable, unique names of choices.
+
+    These are the names of their types; if several choices are of the same type, numbers are added, except those in `replaced`.
+    """
     plain = [_short_label(setting, choice) for choice in choices]
     alike = {name: [choice for choice, own in zip(choices, plain, strict=True) if own == name] for name in plain}
     names = [
@@ -168,8 +171,8 @@ def _short_label(setting: str, choice: AxisChoice) -> str:
 def _label_with_numbers(name: str, choice: AxisChoice, alike: Sequence[AxisChoice], replaced: Collection[str]) -> str:
     """Return the name of a choice with its scalar fields, except those that other axes replace.
 
-    Python numbers are further options of diffrax's classes, which have many: only those are shown in which choices that are
-    `alike` differ.
+    Python numbers are options of diffrax's classes, which have many: they are only shown if they differ among the choices
+    `alike`.
     """
     if isinstance(choice, ConstrainedSystem):
         return name
@@ -185,7 +188,10 @@ def _label_with_numbers(name: str, choice: AxisChoice, alike: Sequence[AxisChoic
 
 
 def one_of_several(methods: Sequence[AxisChoice]) -> tuple[AxisChoice, ...]:
-    """Return the methods; compilable dense ones are replaced by a `OneOf` of all their kinds, to give them the same structure."""
+    """Return the methods, with compilable dense ones of several kinds replaced by a `OneOf` of all these kinds.
+
+    All of these then have the same structure, and share a program.
+    """
     dense: dict[int, Dense] = {}
     for k, method in enumerate(methods):
         if isinstance(method, Dense) and not isinstance(method, Auto | Elimination | OneOf) and not reason_for_plain(method):
@@ -222,7 +228,7 @@ class SweepDesign(abc.ABC):
 
     @abc.abstractmethod
     def unit(self, dimensions: int) -> Float[np.ndarray, "n d"]:
-        """Return points of the unit cube."""
+        """Return `n` points of the unit cube, with a coordinate for each axis that is a range or a distribution."""
 
 
 class Sobol(SweepDesign):
@@ -246,14 +252,17 @@ class LatinHypercube(SweepDesign):
 
 
 class Random(SweepDesign):
-    """Independent members."""
+    """Members that are sampled independently of each other."""
 
     def unit(self, dimensions: int) -> Float[np.ndarray, "n d"]:
         return np.random.default_rng(self.seed).random((self.n, dimensions))
 
 
 def scale_to_range(values: Values, unit: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"] | None:
-    """Map points of the unit interval to a range (low, high) or a frozen distribution of scipy.stats; None for other values."""
+    """Return points of a range (low, high) or of a frozen distribution of scipy.stats; None for other values.
+
+    They are mapped from points `unit` of the unit interval.
+    """
     if hasattr(values, "ppf"):
         return np.asarray(cast(Distribution, values).ppf(unit), float)
     ends = np.asarray(cast(Numbers, values), float)

@@ -34,9 +34,10 @@ def compute_members(
     memory: int = MEMORY,
     expect: Callable[[Sequence[Chunk]], None] = lambda chunks: None,
 ) -> Iterator[Done]:
-    """Compute the members that are not done: first some pieces of each group, then chunks sized by the duration of these.
+    """Compute the members that are not done, and yield each finished chunk with its data and duration.
 
-    `expect` is called with the chunks that follow the first ones, with `work` in seconds.
+    First, some pieces of each group are computed, then chunks whose size follows from the duration of these. `expect` is called
+    with the chunks that follow the first ones, with `work` in seconds.
     """
     orders = members_to_compute(plan, done)
     measured = []
@@ -96,7 +97,7 @@ def cut_chunks(
 
 
 def _cut(seconds: Float[np.ndarray, "n"], piece: int, most: int, limit: float = CHUNK_SECONDS) -> list[slice]:
-    """Cut members into consecutive parts of whole pieces, of at most `limit` seconds and `most` members each."""
+    """Return consecutive slices of members, each of whole pieces, at most `limit` seconds and at most `most` members."""
     most = max(piece, most // piece * piece)
     parts, start = [], 0
     total = np.concatenate([[0.0], np.cumsum(seconds)])

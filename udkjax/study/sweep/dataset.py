@@ -33,7 +33,7 @@ NOT_COMPUTED = -1  # the result of an unfinished member
 
 
 def describe_group(plan: SweepPlan, group: Group) -> dict[str, StoredVariable]:
-    """Return the variables that are stored for each member of a group."""
+    """Return the variables that are stored for each member of a group, by name."""
     shape, variables = plan.state_shape_of(group), {}
     labels = {name: label for measure in plan.measures for name, label in measure.labels.items()} | LABELS
     outputs = group_run(plan, group.index).outputs
@@ -53,7 +53,7 @@ def describe_group(plan: SweepPlan, group: Group) -> dict[str, StoredVariable]:
 
 
 def _derivative_unit(units: str, by: str, plan: SweepPlan) -> str:
-    """Return the unit of a derivative; empty if it is unknown."""
+    """Return the unit of the derivative of a variable with `units` by the number `by`; "" if it is unknown."""
     below = next((column.units for column in plan.columns if column.name == by), None)
     below = plan.mechanism.unit_of(by) if below is None else below
     return "" if not units or not below or "," in units else f"{units}/({below})"
@@ -90,7 +90,7 @@ def bytes_per_member(plan: SweepPlan) -> int:
 
 
 def assemble(plan: SweepPlan, finished: Iterable[tuple[Int[np.ndarray, "n"], Mapping[str, np.ndarray]]]) -> "xarray.Dataset":
-    """Return the xarray Dataset of a plan from pairs of members and their stored variables, in any order.
+    """Return the xarray Dataset of a plan from pairs of members' indices and their stored variables, in any order.
 
     Unfinished members have NaN and the result -1.
     """
@@ -130,7 +130,10 @@ def _fill_value(name: str, variable: StoredVariable) -> float | int | bool:
 def _write_members(
     into: np.ndarray, variable: StoredVariable, members: np.ndarray, values: np.ndarray, places: Sequence[int] | None
 ) -> None:
-    """Write the values of members; `places` are the indices of a group's bodies among all bodies."""
+    """Write the values of members into an array of all members.
+
+    `places` are the indices of a group's bodies among all bodies; None if the group has all of them.
+    """
     if "body" in variable.dims and places is not None:
         axis = variable.dims.index("body")
         for k, index in enumerate(places):
@@ -210,7 +213,7 @@ class _AxisName:
 
 
 def _shown(plan: SweepPlan, setting: str, value: PyTree) -> str:
-    """Return a setting as text, with the names of axes instead of the numbers that these replace."""
+    """Return a setting as text, with the names of axes in place of the numbers that they replace."""
     if value is None:
         return "none"
     for column in plan.columns:

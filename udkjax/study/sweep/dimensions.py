@@ -1,4 +1,4 @@
-"""Checks axes and converts them to the dimensions of a sweep; all mistakes are reported together."""
+"""Checks of axes, and their conversion to the dimensions of a sweep; all mistakes are reported together."""
 
 import difflib
 import itertools
@@ -62,7 +62,10 @@ class SweepError(Mistakes):
 
 @contextmanager
 def refuse_untraceable(subject: str) -> Iterator[None]:
-    """Raise a `SweepError` with the cure if JAX cannot trace a user's function, which `subject` names."""
+    """Return a context in which errors of tracing a user's function become a `SweepError` with the cure.
+
+    `subject` names the function.
+    """
     try:
         yield
     except (
@@ -76,7 +79,7 @@ def refuse_untraceable(subject: str) -> Iterator[None]:
 
 
 def lay_out(mechanism: StudyModel, axes: Mapping[str, AxisValues], design: SweepDesign | None = None) -> tuple[Dimension, ...]:
-    """Return the dimensions of a sweep over `axes`.
+    """Return the dimensions of a sweep over `axes`; ranges of axes are sampled by the design, along the dimension "member".
 
     Raises:
         SweepError: lists every mistake.
@@ -204,7 +207,7 @@ def _unknown_targets(mechanism: StudyModel, name: str, of: Sequence[str]) -> Ite
 
 
 def _suggest_ending(target: str, parameters: Iterable[str]) -> str:
-    """Suggest a parameter whose last part is similar, such as `body.a.mass` for `mass`."""
+    """Return a suggestion of a parameter whose last part is similar, such as `body.a.mass` for `mass`; "" if there is none."""
     last = {full.rpartition(".")[2]: full for full in parameters}
     close = difflib.get_close_matches(target, last, n=1)
     return f"; did you mean {quote(last[close[0]])}?" if close else ""
@@ -275,7 +278,7 @@ def check_settings(mechanism: StudyModel, dimensions: Sequence[Dimension], setti
 
 
 def _combinations(dimensions: Sequence[Dimension], settings: Settings) -> Iterator[dict[str, Any]]:
-    """Iterate over the combinations of the settings that are checked together."""
+    """Iterate over the combinations of those settings that are checked together."""
     fixed = {name: settings[name] for name in TOGETHER if name in settings}
 
     def choices(dimension: Dimension) -> list[dict[str, Any]]:
@@ -288,12 +291,15 @@ def _combinations(dimensions: Sequence[Dimension], settings: Settings) -> Iterat
 
 
 def uses_number(setting: str, choice: AxisChoice, name: str) -> bool:
-    """Return True if a choice of a setting has this number, as `Baumgarte` has gains and `Auto`, the default, a `branch_tol`."""
+    """Return True if a choice of a setting has the number `name`.
+
+    For example, `Baumgarte` has the gains `alpha` and `beta`, and `Auto`, the default method, has a `branch_tol`.
+    """
     return hasattr(Auto() if setting == "method" and choice is None else choice, name)
 
 
 def check_tangents(mechanism: StudyModel, dimensions: Sequence[Dimension], names: Sequence[str]) -> list[str]:
-    """Return the mistakes in the names of derivatives."""
+    """Return the mistakes in the names of the numbers with respect to which derivatives are wanted."""
     columns = {column.name: column for dimension in dimensions for column in dimension.columns}
     parameters, problems = mechanism.number_fields(), []
     for name in names:

@@ -49,7 +49,10 @@ def run(plan: SweepPlan, chunk: Chunk) -> Done:
 
 
 def other_redundant_rows(group: GroupRun, members: np.ndarray, result: np.ndarray) -> dict[tuple[int, ...], np.ndarray]:
-    """Return members that drifted because their redundant rows differ from the group's, by redundant rows."""
+    """Return the indices in `members` of members that drifted because their redundant rows differ from the group's.
+
+    The result maps the members' own redundant rows to these indices.
+    """
     by_rows: dict[tuple[int, ...], list[int]] = {}
     for k in np.flatnonzero(result == Result.drift).tolist():
         inputs = jax.tree.map(lambda x: x[0], group.own(members[k : k + 1]))
@@ -142,7 +145,13 @@ def dask_engine(client: "distributed.Client | None" = None) -> Executor:
 
 @contextmanager
 def start_client(scheduler: str | None = None) -> Iterator["distributed.Client"]:
-    """Start a client of the scheduler at an address, or of new worker processes, one per thread, which end with the client."""
+    """Return a context with a client of the scheduler at an address; by default of new worker processes, one per thread.
+
+    The client, and new workers, end with the context.
+
+    Raises:
+        ClusterError: no scheduler answers at the address.
+    """
     with OptionalImport():
         import distributed
     cluster = {"n_workers": thread_count(), "threads_per_worker": 1, "dashboard_address": ":0"}

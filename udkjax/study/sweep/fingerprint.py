@@ -70,7 +70,10 @@ def _measure(plan: SweepPlan, measure: Measure) -> dict[str, JsonValue]:
 
 
 def _solution(plan: SweepPlan) -> Solution:
-    """Return a solution with the right shapes, for tracing; with events or friction by which joints stick that of a run."""
+    """Return a solution with the right shapes, for tracing the functions of measures.
+
+    With events, or friction by which joints stick, it has the fields that such a run has.
+    """
     events = {name: x for name, x in plan.settings.items() if name in ("events", "max_events")}
     if events or (plan.mechanism.has_bodies and Friction.may_stick(plan.mechanism.forces.values())):
         shapes = eqx.filter_eval_shape(lambda model: simulate(model, plan.ts, throw=False, **events), plan.mechanism)
@@ -82,7 +85,7 @@ def _solution(plan: SweepPlan) -> Solution:
 
 
 def describe_function(function: Callable, *arguments: PyTree) -> dict[str, JsonValue]:
-    """Describe a function by its name, and digests of its traced operations and constants."""
+    """Return a description of a function: its name, and digests of its traced operations and constants."""
     program = eqx.filter_make_jaxpr(function)(*arguments)[0]
     text = _without_addresses(str(program.jaxpr))
     constants = b"".join(np.ascontiguousarray(x).tobytes() for x in program.consts if eqx.is_array(x))
@@ -91,7 +94,7 @@ def describe_function(function: Callable, *arguments: PyTree) -> dict[str, JsonV
 
 
 def describe_model(mechanism: Model, n: int) -> dict[str, JsonValue]:
-    """Describe a model with n coordinates by its text and numbers."""
+    """Return a description of a model with n coordinates: its text and its numbers."""
     if not mechanism.has_bodies:
         traced = mechanism.traced(n)
         text = traced.functions.text if traced.has_programs else repr(mechanism)
@@ -106,7 +109,7 @@ def describe_model(mechanism: Model, n: int) -> dict[str, JsonValue]:
 
 
 def describe_value(value: PyTree) -> JsonValue:
-    """Describe a number, an array or a choice."""
+    """Return a description of a number, an array or a choice; large arrays are described by a digest."""
     if value is None or isinstance(value, str | bool | int):
         return value
     if isinstance(value, float | np.ndarray | np.number | jax.Array):
@@ -132,12 +135,12 @@ def describe_value(value: PyTree) -> JsonValue:
 
 
 def _without_addresses(text: str) -> str:
-    """Return a text without addresses in memory, such as those of functions, which differ between processes."""
+    """Return a text without memory addresses, such as those of functions, which differ between processes."""
     return re.sub(r"0x[0-9a-f]+", "", text)
 
 
 def digest(content: bytes) -> str:
-    """Return the first 64 bits of the SHA-256, as a string."""
+    """Return the first 64 bits of the SHA-256 of some bytes, as hexadecimal digits."""
     return hashlib.sha256(content).hexdigest()[:16]
 
 

@@ -55,7 +55,7 @@ def loads_grid(text: str, source: str = "") -> dict[str, Any]:
 
 
 class _GridReader:
-    """Reads a grid file. Mistakes are added to `problems`; invalid values are replaced by None or an empty value.
+    """A reader of a grid file. Mistakes are added to `problems`; invalid values are replaced by None or an empty value.
 
     If `drawn`, a design draws the members from ranges and distributions, instead of lists of values. Paths of other files are
     relative to `folder`.
@@ -187,7 +187,7 @@ class _GridReader:
         return ()
 
     def of(self, path: str, given: "Toml | None") -> str | tuple[str, ...] | Setter | None:
-        """Read the target of an axis: names, the length or initial angle of bodies, or names with factors."""
+        """Read the target of an axis: names, the length or initial angle of bodies, or names with factors; None if not given."""
         if given is None or isinstance(given, str):
             return given
         if isinstance(given, list):
@@ -227,7 +227,7 @@ class _GridReader:
     # --- single values
 
     def wrong(self, path: str, problem: str) -> None:
-        """Report a mistake."""
+        """Report a mistake in the entry with this path."""
         self.problems.append(f"{path}: {problem}")
 
     def check_keys(self, path: str, given: TomlTable, expected: Iterable[str]) -> None:
@@ -287,5 +287,5 @@ class _GridReader:
 
 
 def key_of(name: str) -> str:
-    """Return a key as written in a TOML file."""
+    """Return a key as written in a TOML file, in quotes if necessary."""
     return name if name.replace("_", "").replace("-", "").isalnum() else quote(name)

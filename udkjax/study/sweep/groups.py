@@ -44,15 +44,18 @@ STRAIGHT_METHODS = (type(None), Auto, Elimination)  # without branches: fast in 
 
 
 class Shared(NamedTuple):
-    """Numbers that all members of a group share: those of settings, and quantities computed from them if these are equal."""
+    """Numbers that all members of a group share.
+
+    These are the numbers of settings, and quantities that are computed from the mechanism if they are equal for all members.
+    """
 
     settings: Mapping[str, PyTree]
     closure: Closure | None  # the closed initial state
-    elements: PyTree  # of the mechanism, which may follow from a drawing
+    elements: PyTree  # numbers of the mechanism's elements, which may follow from a drawing
 
 
 class Own(NamedTuple):
-    """The numbers of single members: numbers of choices by setting, numbers of axes by name, and indices of members."""
+    """The numbers of single members: numbers of choices by setting, numbers of axes by name, and the members' indices."""
 
     choices: Mapping[str, PyTree]
     axes: Mapping[str, np.ndarray | Array]
@@ -60,7 +63,14 @@ class Own(NamedTuple):
 
 
 class GroupChoices(NamedTuple):
-    """The choices of an axis in a group: axis, stacked numbers, common static part, and indices of the choices."""
+    """The choices of one setting in a group, which differ only in numbers.
+
+    Attributes:
+        axis: name of the axis of the choices.
+        numbers: the numbers of the choices, stacked.
+        static: the common rest of the choices.
+        places: indices of the choices on the axis.
+    """
 
     axis: str
     numbers: PyTree
@@ -69,7 +79,10 @@ class GroupChoices(NamedTuple):
 
 
 class GroupRun:
-    """The members of a group and their program; `redundant` are rows of Psi to leave out, by default the mechanism's."""
+    """The members of a group and their program, which is a function of one member.
+
+    `redundant` are the rows of Psi to leave out, by default those of the group's mechanism.
+    """
 
     def __init__(self, plan: SweepPlan, index: int, redundant: tuple[int, ...] | None = None):
         group = plan.groups[index]
@@ -120,7 +133,7 @@ class GroupRun:
         )
 
     def own(self, members: Int[np.ndarray, "n"]) -> Own:
-        """Return the numbers of members, each (n, ...)."""
+        """Return the numbers of these members that are not shared with others, each (n, ...)."""
         places = self.plan.places(members)
         choices = {}
         for setting, choice in self._own.items():
@@ -129,7 +142,7 @@ class GroupRun:
         return Own(choices, {column.name: column.numbers[places[column.name]] for column in self.numbers}, members)
 
     def mechanism(self, shared: Shared, own: Own, shift: Mapping[str, Array]) -> StudyModel:
-        """Return the mechanism of one member, with `shift` added to the variables of differentiation."""
+        """Return the mechanism of one member; `shift` is added to the numbers with respect to which derivatives are computed."""
         mechanism: Any = self._setting("mechanism", shared, own)
         if self._elements is not None:
             mechanism.know_elements(eqx.combine(shared.elements, self._elements))
@@ -151,7 +164,7 @@ class GroupRun:
         return mechanism.with_parameters(parameters) if parameters else mechanism
 
     def settings(self, shared: Shared, own: Own, shift: Mapping[str, Array]) -> dict[str, PyTree]:
-        """Return the settings of one member, including output times."""
+        """Return the settings of one member, including output times; for `shift` see `mechanism`."""
         names = {*self._static, *self._own} - {"mechanism"}
         values = {name: self._setting(name, shared, own) for name in names}
         numbers = {
@@ -172,7 +185,7 @@ class GroupRun:
         return values | numbers | {"ts": ts}
 
     def __call__(self, shared: Shared, own: Own, shifts: Array) -> Outputs:
-        """Return the stored variables of one member, with `shifts` (names,) added to the variables of differentiation."""
+        """Return the stored variables of one member; for `shifts` (names,), in the order of `names`, see `mechanism`."""
         shift = dict(zip(self.names, shifts, strict=True))
         mechanism = self.mechanism(shared, own, shift)
         settings = self.settings(shared, own, shift)
@@ -193,7 +206,7 @@ class GroupRun:
             self._placed = self.program.place(self.shared, self.own(self.members[:1]))
 
     def compute(self, members: Int[np.ndarray, "n"]) -> dict[str, np.ndarray]:
-        """Compute the stored variables of members, each (n, ...)."""
+        """Return the stored variables of members, each (n, ...)."""
         self.compile()
         stored, slopes = self.program(self._placed, self.own(members))
         return stored | {name: slopes[of][..., k] for name, (of, k) in self._names_of_slopes(slopes).items()}
@@ -205,7 +218,7 @@ class GroupRun:
         return stored | {name: stored[of] for name, (of, _) in self._names_of_slopes(slopes).items()}
 
     def _names_of_slopes(self, slopes: Mapping[str, object]) -> dict[str, tuple[str, int]]:
-        """Return, for each derivative, its variable and the index of its variable of differentiation."""
+        """Return, by the name of each derivative, its variable, and the index of the number with respect to which it is taken."""
         return {f"d_{of}_d_{by}": (of, k) for of in slopes if of not in (END, *self.seconds) for k, by in enumerate(self.names)}
 
     def _closure(self, shared: Shared, mechanism: StudyModel, analysis: Analysis | None) -> Closure | None:
@@ -224,7 +237,14 @@ def _with(choice: PyTree, name: str, value: np.ndarray | Array) -> PyTree:
 
 
 def _piece(members: int, in_lanes: bool, platform: str, states: int) -> int:
-    """Return the number of members, with `states` bytes each, in a piece on each device: several in vector lanes, or one."""
+    """Return the number of members in a piece on each device: several in vector lanes, or one.
+
+    Args:
+        members: number of members of the group.
+        in_lanes: True if the program is fast in vector lanes.
+        platform: platform of the devices.
+        states: bytes of a member's states with their derivatives.
+    """
     full = -(-members // LANE_WIDTH) * LANE_WIDTH
     if platform not in CHUNKED_PLATFORMS:
         return min(DEVICE_PIECE, max(LANE_WIDTH, DEVICE_BYTES // states), full)
@@ -232,7 +252,7 @@ def _piece(members: int, in_lanes: bool, platform: str, states: int) -> int:
 
 
 def group_run(plan: SweepPlan, group: int, redundant: tuple[int, ...] | None = None) -> GroupRun:
-    """Return the program of the members of a group, compiled once per process."""
+    """Return the `GroupRun` of a group, whose program is compiled once per process."""
     return _group_run(plan, group, redundant)
 
 

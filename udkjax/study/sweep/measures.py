@@ -94,7 +94,10 @@ NAMELESS = "lambda"  # name of an anonymous function
 
 
 def guess_label(name: str, shape: tuple[int, ...], outputs: int, state_shape: tuple[int, ...], units: str = "") -> Label:
-    """Label the result of a user-defined function by its shape."""
+    """Return the label of a variable that a user-defined function returns, with dimensions guessed from its shape.
+
+    `outputs` is the number of output times.
+    """
     dims = [f"{name}_{k}" for k in range(len(shape))]
     of_state = ("body", "coordinate")[-len(state_shape) :]
     if shape[-len(state_shape) :] == state_shape and shape != (outputs,):
@@ -150,7 +153,10 @@ def _evaluate_channel(channel: Channel, run: MeasuredRun) -> dict[str, Array]:
 
 
 def _call(function: UserMeasure, name: str, run: MeasuredRun) -> dict[str, Array]:
-    """Call a user-defined function; the measure's name, if any, is the name of a single array, or a prefix of several names."""
+    """Call a user-defined function; return its arrays by name.
+
+    The measure's name is that of a single array, or a prefix of the names in a mapping, unless the function has no name.
+    """
     with refuse_untraceable(f"measure {quote(name)}"):
         outputs = function(run.mechanism, run.solution)
     if isinstance(outputs, Mapping):
@@ -186,7 +192,10 @@ _STATE, _OVER_TIME = ("body", "coordinate"), ("time", "body", "coordinate")
 
 
 def _named(name: str, along: bool = True, **labels: Label) -> Callable[[Compute], Compute]:
-    """Decorate a function as a measure with a name, the need for all output times, and the labels of its variables."""
+    """Return a decorator that adds a function to `MEASURES` as the measure with a name.
+
+    `along` is True if the measure needs all output times, and `labels` are those of its variables.
+    """
 
     def add(compute: Compute) -> Compute:
         MEASURES[name] = Measure(name, compute, labels, along)
@@ -260,7 +269,7 @@ def _seconds(run: MeasuredRun) -> dict[str, Array]:
 
 @_named("rank", rank=Label(("time",), "1", "rank of D by the method's own rule; -1: not reached"))
 def _rank(run: MeasuredRun) -> dict[str, Array]:
-    """Compute ranks by the method's rule; for `Auto`, by that of its rank-revealing fallback."""
+    """Return ranks by the method's rule; for `Auto`, by the rule of its rank-revealing fallback."""
     method = Auto() if run.method is None else run.method
     method = method.rank_revealing if isinstance(method, Auto) else method
     if not run.mechanism.has_bodies:

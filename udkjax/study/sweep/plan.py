@@ -95,7 +95,7 @@ class SweepPlan:
         return tuple(column for dimension in self.dimensions for column in dimension.columns)
 
     def places(self, members: Int[np.ndarray, "n"]) -> dict[str, np.ndarray]:
-        """Return the index of each member's value on each axis."""
+        """Return the index of each member's value on each axis, by the name of the axis."""
         indices = np.unravel_index(members, self.shape)
         return {column.name: k for d, k in zip(self.dimensions, indices, strict=True) for column in d.columns}
 
@@ -118,7 +118,10 @@ class SweepPlan:
 
     @cached_property
     def first_alike(self) -> tuple[int, ...]:
-        """For each group, the first group with the same program; their methods differ only in the number of a `OneOf`."""
+        """For each group, the index of the first group with the same program.
+
+        The methods of such groups differ only in the number of a `OneOf`.
+        """
         numbers = {column.name: _number_structures(column.computed) for column in self.columns if column.is_choice}
 
         def key(group: Group) -> tuple:

@@ -50,7 +50,7 @@ class MemoryStore:
         self._done.append((np.asarray(chunk.members), data))
 
     def read_chunks(self) -> Iterator[tuple[np.ndarray, Variables]]:
-        """Iterate over finished chunks: members, and their data."""
+        """Iterate over finished chunks: the indices of members, and their data."""
         yield from self._done
 
 
@@ -100,7 +100,7 @@ class FolderStore:
         self._write(f"{CHUNKS}/{chunk.index:06d}-{self._sweep}-{digest(content)}.npz", content)
 
     def read_chunks(self) -> Iterator[tuple[np.ndarray, Variables]]:
-        """Iterate over finished chunks, as members and their data. Damaged files are removed."""
+        """Iterate over finished chunks: the indices of members, and their data. Damaged files are removed."""
         for file in self._files():
             try:
                 content = file.read_bytes()
@@ -115,7 +115,11 @@ class FolderStore:
             yield data.pop(MEMBERS), {name.removeprefix(STORED_PREFIX): values for name, values in data.items()}
 
     def _begin(self, sweep: dict[str, JsonValue]) -> None:
-        """Write the fingerprint of the sweep, or compare it with an existing one of which a chunk is finished."""
+        """Write the fingerprint of the sweep, or compare it with that of the folder if this has finished chunks.
+
+        Raises:
+            StoreError: the folder contains another computation.
+        """
         for file in (*self.folder.glob(f"*{UNFINISHED_SUFFIX}"), *(self.folder / CHUNKS).glob(f"*{UNFINISHED_SUFFIX}")):
             file.unlink(missing_ok=True)  # file of a process that was killed while writing
         manifest = self.folder / f"{self.what}.json"
@@ -162,7 +166,7 @@ def open_store(
 
 
 def read_variable(store: MemoryStore | FolderStore, name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return the finished members, and their values of one stored variable."""
+    """Return the indices of the finished members, and their values of one stored variable."""
     chunks = [(members, data[name]) for members, data in store.read_chunks()] or [(np.empty(0, int), np.empty(0, int))]
     members, values = zip(*chunks, strict=True)
     return np.concatenate(members), np.concatenate(values)

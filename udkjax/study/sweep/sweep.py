@@ -184,7 +184,7 @@ class Watch:
         self.show(self.state)
 
     def expect(self, chunks: Sequence[Chunk]) -> None:
-        """Set the remaining work to that of `chunks`, all of those that remain."""
+        """Set the remaining work to that of `chunks`, which are all of the remaining chunks."""
         self.since, self.work = time.monotonic(), sum(chunk.work for chunk in chunks)
 
     def __call__(self, chunk: Chunk, data: Mapping[str, np.ndarray], seconds: float | None = None) -> None:
@@ -220,7 +220,7 @@ def _message(
 
 
 def _count_failures(previous: Mapping[str, int], codes: Numbers) -> dict[str, int]:
-    """Add members to the counts of each `Result` other than success."""
+    """Return the number of members for each `Result` other than success: `previous` numbers plus those of the results `codes`."""
     counts = Counter(previous)
     for code, count in zip(*np.unique(np.asarray(codes, int), return_counts=True), strict=True):
         if code != Result.successful:
@@ -229,7 +229,7 @@ def _count_failures(previous: Mapping[str, int], codes: Numbers) -> dict[str, in
 
 
 def _find_slowest(previous: tuple[int, T] | None, indices: Numbers, values: Numbers | None) -> tuple[int, T] | None:
-    """Return the index and value of the largest value, or the previous maximum if that is at least as large."""
+    """Return the largest of `values` with its index in `indices`, as (index, value), unless `previous` is at least as large."""
     if values is None:
         return previous
     values = np.atleast_1d(values)
@@ -242,7 +242,7 @@ def _find_slowest(previous: tuple[int, T] | None, indices: Numbers, values: Numb
 
 
 def duration(seconds: float) -> str:
-    """Format a duration (s)."""
+    """Return a duration (s) as text, in suitable units."""
     if seconds < 120:
         return f"{seconds:.0f} s"
     minutes = round(seconds / 60)

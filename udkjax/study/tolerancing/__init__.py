@@ -1,6 +1,6 @@
 """Tolerances of dimensions: how far a mechanism deviates if its numbers do, and how often it stays within limits.
 
-dimensions   numbers with tolerances and clearances, and those of samples
+dimensions   numbers with tolerances and clearances, and their values in samples
 measures     measures of samples: positions over a drive by machine code, or a function of the mechanism
 cheapest     the tolerances of least cost with a yield
 tolerances   the public function, and its result

@@ -1,4 +1,4 @@
-"""The tolerances of least cost with a yield.
+"""The tolerances of least cost with a given yield, the share of samples within all limits.
 
 With the tolerances times t, a quadratic function of the deviations (second_order.py) says which samples are within all limits.
 The cost, the sum of c_k / t_k, is minimized with this yield by SLSQP, with the edges of the limits smoothed. Then all tolerances
@@ -19,14 +19,14 @@ HALVINGS = 20  # of the interval of the common factor
 
 
 class Limits(NamedTuple):
-    """Limits of L of the measures."""
+    """The limits of L measures."""
 
     which: np.ndarray  # (L,): indices of these measures
     low: np.ndarray
     high: np.ndarray
 
     def holds(self, measured: Float[np.ndarray, "N G"]) -> np.ndarray:
-        """Return the samples and limits (N, L) that hold; those without a value do not."""
+        """Return a mask (N, L) of the limits that each sample satisfies; a measure without a value (NaN) satisfies none."""
         values = measured[:, self.which]
         return (values >= self.low) & (values <= self.high)
 
@@ -38,10 +38,10 @@ def optimal_scales(
 
     Args:
         model: the measures as quadratic functions of the deviations.
-        limits: their limits.
+        limits: the limits of measures.
         u: samples of deviations.
         wanted: the yield.
-        costs: c.
+        costs: cost c of each given tolerance; t times the tolerance costs c / t.
     """
     from scipy.optimize import minimize
 
@@ -75,7 +75,10 @@ def optimal_scales(
 
 
 def common_factor(yield_of: Callable[[float], float], wanted: float) -> float:
-    """Return the largest factor with which the yield is at least `wanted`, for a yield that falls with the factor."""
+    """Return the largest common factor of tolerances with which the yield is at least `wanted`.
+
+    `yield_of` returns the yield for a factor; it must fall as the factor grows.
+    """
     low, high = 1.0, 1.0
     while yield_of(low) < wanted and low > 1.0 / MOST_SCALE:
         low, high = low / 1.5, low

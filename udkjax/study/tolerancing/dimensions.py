@@ -1,7 +1,8 @@
-"""Tolerances of numbers of a mechanism, and the numbers of samples.
+"""Tolerances of numbers of a mechanism, and the values of these numbers in samples.
 
-Each number is x = x0 + c + s u: its nominal value, the middle of its limits, its standard deviation, and a random deviation u
-with zero mean and unit variance. Numbers that share a source, such as holes of one drill jig, have the same u.
+Each number is x = x0 + c + s u, with x0 its nominal value, c the middle of its limits relative to x0, s its standard deviation,
+and u a random deviation with zero mean and unit variance. Numbers that share a source, such as holes of one drill jig, have the
+same u.
 """
 
 from collections.abc import Mapping, Sequence
@@ -29,7 +30,7 @@ SHAPE = "pin", "length", "number"  # kinds of numbers of a drawing that may set 
 
 
 class DeviationSource(NamedTuple):
-    """An independent deviation u: its name, and the tolerance whose distribution it has; a clearance has two."""
+    """An independent deviation u: its name, and the tolerance that has its distribution. A clearance has two, in x and y."""
 
     name: str
     tolerance: Tolerance
@@ -38,7 +39,7 @@ class DeviationSource(NamedTuple):
 
 @dataclass(frozen=True)
 class _Play:
-    """Moves a pin in its hole along x or y of the second body."""
+    """A function of a mechanism and a value that moves a pin in its hole along x or y of the second body by this value (m)."""
 
     joint: str
     axis: int
@@ -88,7 +89,7 @@ class ToleratedNumbers:
         self._require_independence([name for name in given if not isinstance(given[name], PinClearance) and _kind(name) in SHAPE])
 
     def _require_independence(self, given: Sequence[str]):
-        """Refuse numbers of which one sets another, such as a pin and a length that ends there: one would hide the other."""
+        """Refuse numbers if one of them sets another, such as a pin and a length that ends there: one would hide the other."""
         if len({_kind(name) for name in given}) <= 1:
             return  # numbers of one kind are independent
         read, own = [Parameter(name) for name in given], {name: k for k, name in enumerate(self.names)}
@@ -106,7 +107,7 @@ class ToleratedNumbers:
 
     @property
     def count(self) -> int:
-        """The number P of numbers."""
+        """The number P of numbers with tolerances."""
         return len(self.nominal)
 
     def moved(self, x: Array) -> Mechanism:
@@ -114,11 +115,11 @@ class ToleratedNumbers:
         return apply_values(self.mechanism, self.targets, x)
 
     def values(self, u: Float[np.ndarray, "N K"], scales: Float[np.ndarray, "K"] | float = 1.0) -> Float[np.ndarray, "N P"]:
-        """Return the numbers of samples from the deviations of their sources, which may be scaled."""
+        """Return the P numbers in N samples, from the deviations u of their K sources, which are multiplied by `scales`."""
         return self.nominal + self.middle + self.sizes * (u * scales)[:, self.owners]
 
     def deviations(self, normal: Float[np.ndarray, "N K"]) -> Float[np.ndarray, "N K"]:
-        """Return the deviations u of all sources from numbers with a normal distribution."""
+        """Return the deviations u of all sources, from independent standard normal numbers."""
         u = np.empty_like(normal)
         for k, source in enumerate(self.sources):
             u[:, k] = source.tolerance.units(normal[:, k])
@@ -128,7 +129,10 @@ class ToleratedNumbers:
         return u
 
     def _source(self, source: DeviationSource) -> int:
-        """Return the number of a source, a new one unless it is shared."""
+        """Return the index of a source in `sources`, to which it is added if it is new.
+
+        A source that has the same `shared` name as an earlier one has the index of the earlier one.
+        """
         shared = source.tolerance.shared
         for k, other in enumerate(self.sources):
             if shared and other.tolerance.shared == shared:

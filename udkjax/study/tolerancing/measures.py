@@ -57,13 +57,13 @@ class _Reading(NamedTuple):
 
 
 class Measuring:
-    """Evaluates measures of samples.
+    """The measures of samples, as a function of the numbers of samples.
 
     Args:
-        numbers: the numbers that differ.
+        numbers: the numbers that differ between samples.
         measures: measures by name, or texts that are their own names.
         driver: the driver or coordinate, as for `kinematics`; by default the only driver.
-        values: values of the driver.
+        values: values of the driver; by default every 5 degrees of a turn.
 
     Raises:
         SceneError: lists every mistake.
@@ -105,7 +105,10 @@ class Measuring:
             )
 
     def __call__(self, x: Float[np.ndarray, "N P"]) -> Float[np.ndarray, "N G"]:
-        """Return the measures of samples; NaN where a sample does not reach all values, or its function is not finite."""
+        """Return the G measures of N samples of the numbers.
+
+        A measure is NaN if the sample does not reach all values of the driver, or if its function is not finite.
+        """
         found = np.empty((len(x), len(self.names)))
         place = {name: k for k, name in enumerate(self.names)}
         if self._readings:
@@ -148,7 +151,10 @@ class Measuring:
         return _Reading(slice(first, first + count), reduction, read)
 
     def _coordinate(self, text: str, both: bool) -> tuple[Callable[[Mechanism, Array, Array], list[Array]], int]:
-        """Return the function that reads a coordinate, or both of a point, and how many there are."""
+        """Return a function that reads the coordinate named by a text, and the number of values that it reads.
+
+        If `both`, the text may also name a point, of which the function reads x and y.
+        """
         of, _, component = text.rpartition(".")
         if both and component not in ("x", "y", "angle"):
             of, component = text, ""

@@ -40,7 +40,7 @@ class SecondOrder(NamedTuple):
 
 
 class Share(NamedTuple):
-    """The share of a deviation in the variance of a measure: by itself, and with all pairs that it is part of."""
+    """The share of a deviation in the variance of a measure: by itself (`first`), and with all its pairs (`total`)."""
 
     first: float
     total: float
@@ -48,7 +48,7 @@ class Share(NamedTuple):
 
 @prints_table
 class CheapestTolerances(NamedTuple):
-    """The tolerances of least cost with a yield."""
+    """The tolerances of least cost with a given yield."""
 
     deviations: dict[str, tuple[float, float]]  # the lower and upper deviation of each number, in SI units
     factors: dict[str, float]  # relative to the given tolerances
@@ -71,7 +71,7 @@ class ToleranceAnalysis:
         measured: the measures of the samples (N, G); NaN if a sample does not reach all values of the drive.
         nominal: the measures with the nominal numbers (G,).
         yield_: the share of samples within all limits; without limits, of those that reach all values.
-        standard_error: its standard error.
+        standard_error: standard error of the yield.
         outside: the share of samples outside the limits of each measure.
         not_assembled: the share of samples without a value.
 
@@ -95,7 +95,10 @@ class ToleranceAnalysis:
         self._drawn = Units.of(numbers.mechanism.drawing)
 
     def shown(self, name: str) -> tuple[str, float]:
-        """Return the unit in which the drawing shows a measure, empty for functions, and its size in the SI unit."""
+        """Return the unit in which the drawing shows a measure, and the size of this unit in SI units.
+
+        For functions, whose units are unknown, return "" and 1.
+        """
         unit = self._measuring.units[name]
         return (self._drawn.shown(unit), self._drawn.size(unit)) if unit else ("", 1.0)
 
@@ -121,7 +124,7 @@ class ToleranceAnalysis:
 
     @cached_property
     def second_order(self) -> SecondOrder:
-        """Mean and standard deviation from first and second differences, without samples; compared with the samples."""
+        """Means and standard deviations from first and second differences, without samples; compared with those of samples."""
         model, (own, pairs) = self._quadratic, self._parts
         mean, deviation = model.mean, np.sqrt(own.sum(1) + pairs.sum((1, 2)) / 2.0)
         of_samples, spread = self._reached.mean(0), self._reached.std(0)
@@ -131,7 +134,7 @@ class ToleranceAnalysis:
 
     @property
     def _is_constant(self) -> Bool[np.ndarray, "measures"]:
-        """Mark the measures that vary by rounding errors alone."""
+        """Mask of the measures that vary by rounding errors alone."""
         return self._reached.std(0) <= CONSTANT * np.abs(self._reached).max(0, initial=0.0)
 
     @cached_property
@@ -147,7 +150,7 @@ class ToleranceAnalysis:
         }
 
     def cheapest(self, wanted: float, costs: Mapping[str, float] | None = None) -> CheapestTolerances:
-        """Return the tolerances of least cost with a yield.
+        """Return the tolerances of least cost with which a share `wanted` of the samples is within all limits.
 
         Each tolerance is multiplied by a factor t, and costs c / t, so that half the tolerance costs twice as much.
 
@@ -246,7 +249,7 @@ def tolerances(
     seed: Annotated[int, NOT_NEGATIVE_COUNT] = 0,
     progress: ProgressOption = None,
 ) -> ToleranceAnalysis:
-    """Return how measures of a mechanism vary with the deviations of its numbers, and the share that is within limits.
+    """Analyse the effect of the deviations of a mechanism's numbers on measures, and the share of samples within limits.
 
     Args:
         mechanism: the mechanism, with its nominal numbers.
@@ -316,7 +319,7 @@ def _number(given: Any, unit: str, units: Units) -> float:
 
 
 def _share(holds: np.ndarray) -> tuple[float, float]:
-    """Return the share of samples that hold and its standard error, which is positive even if all hold, or none does."""
+    """Return the share of True, and its standard error, which is positive even if all or none of the samples are True."""
     count = len(holds)
     smoothed = (holds.sum() + 1.0) / (count + 2.0)
     return float(holds.mean()), float(np.sqrt(smoothed * (1.0 - smoothed) / count))

@@ -22,7 +22,13 @@ from udkjax.study.worked.terms import (
 
 
 class BranchPosition(NamedTuple):
-    """The solution of a loop for its unknowns on one branch."""
+    """The solution of a loop for its unknowns on one branch.
+
+    Attributes:
+        words: name of the branch, such as "open"; "" if there is only one.
+        is_actual: True if the drawing's position is on this branch.
+        lines: the equations of the unknowns.
+    """
 
     words: str
     is_actual: bool
@@ -30,7 +36,7 @@ class BranchPosition(NamedTuple):
 
 
 def known_part(symbols: PositionSymbols, loop: VectorLoop) -> tuple[list[EquationLine], list[NamedQuantity]]:
-    """Return the lines of K, the sum of all vectors that do not depend on the unknowns, and its two components."""
+    """Return the lines of K, the sum of all vectors that do not depend on the unknowns, and the components of K."""
     known = [x for x in loop.vectors if not _is_unknown(x, loop)]
     lines = []
     for axis in (0, 1):
@@ -70,7 +76,10 @@ def _is_across(vector: LoopVector, line: LoopVector) -> bool:
 
 
 def _less_turn(letter: str, vector: LoopVector, direction: NamedQuantity, lines: list[EquationLine]) -> NamedQuantity:
-    """Return the angle of a vector's body, from the angle of the vector; appends its line if they differ."""
+    """Return the angle of a vector's body: `direction`, the vector's angle, minus the constant angle between them.
+
+    Its line is appended to `lines`, unless the two angles are equal.
+    """
     if not vector.turn:
         return direction
     angle, line = defined(letter, vector.body, total((1.0, direction), (-1.0, PositionSymbols.turn(vector))), "rad")
@@ -81,7 +90,10 @@ def _less_turn(letter: str, vector: LoopVector, direction: NamedQuantity, lines:
 def _two_angles(
     symbols: PositionSymbols, unknown: Sequence[LoopVector], shared: list[EquationLine], kx: NamedQuantity, ky: NamedQuantity
 ) -> tuple[list[EquationLine], list[BranchPosition]]:
-    """K + a e(phi1) + b e(phi2) = 0: the law of cosines gives phi1 from the direction of K, on both sides of it."""
+    """Return the shared lines and the two branches of K + a e(phi1) + b e(phi2) = 0, with unit vectors e.
+
+    The law of cosines gives phi1 from the direction of K, on both sides of it.
+    """
     first, second = unknown
     a, b = symbols.length(first), symbols.length(second)
     k, k_line = defined("K", "", AppliedFunction("sqrt", (total((1.0, SquaredTerm(kx)), (1.0, SquaredTerm(ky))),)), "m")
@@ -130,7 +142,7 @@ def _angle_and_length(
     kx: NamedQuantity,
     ky: NamedQuantity,
 ) -> tuple[list[EquationLine], list[BranchPosition]]:
-    """K + c e(phi) + s e(psi) = 0 with a known psi: a quadratic equation of s."""
+    """Return the shared lines and the two branches of K + c e(phi) + s e(psi) = 0, with known psi: a quadratic equation of s."""
     c, psi = symbols.length(other), symbols.direction(sliding)
     inner = total((1.0, ProductOfTerms((kx, of_angle("cos", psi)))), (1.0, ProductOfTerms((ky, of_angle("sin", psi)))))
     p, p_line = defined("p", "", inner, "m")
@@ -163,7 +175,10 @@ def _line_of_unknown(
     kx: NamedQuantity,
     ky: NamedQuantity,
 ) -> tuple[list[EquationLine], list[BranchPosition]]:
-    """K + (s e(turn) + h e(turn + 90 degrees)) e(theta) = 0: s by Pythagoras, then the direction of K."""
+    """Return the shared lines and the two branches of K + (s e(turn) + h e(turn + 90 degrees)) e(theta) = 0.
+
+    The product of unit vectors e adds their angles. Pythagoras gives s, and then the direction of K gives theta.
+    """
     squares = [(1.0, SquaredTerm(kx)), (1.0, SquaredTerm(ky))]
     if across is not None:
         squares.append((-1.0, SquaredTerm(symbols.length(across))))
@@ -192,7 +207,10 @@ def _line_of_unknown(
 def _two_lengths(
     symbols: PositionSymbols, unknown: Sequence[LoopVector], shared: list[EquationLine], kx: NamedQuantity, ky: NamedQuantity
 ) -> tuple[list[EquationLine], list[BranchPosition]]:
-    """K + s1 e1 + s2 e2 = 0, linear in both lengths: the product with the normal of one line gives the other."""
+    """Return the shared lines and the only branch of K + s1 e1 + s2 e2 = 0, linear in both lengths.
+
+    The product with the normal of one line gives the length along the other.
+    """
     lines = []
     for one, other in (unknown, unknown[::-1]):
         psi, chi = symbols.direction(one), symbols.direction(other)

@@ -1,4 +1,4 @@
-"""Exercises with other numbers for each student: dimensions at random that assemble and turn, with sheets and solutions."""
+"""Exercises with different numbers for each student: random dimensions of a working mechanism, with sheets and solutions."""
 
 import csv
 import io
@@ -33,11 +33,11 @@ class Variation(NamedTuple):
     """A number that differs between students.
 
     Attributes:
-        title: as it was written, such as length(crank).
-        name: the parameter, or "at" for the value of the driver.
-        low, high: its range, in `unit`.
-        unit: its unit as it is shown.
-        size: the size of its unit, in the unit of the parameter.
+        title: the number as it was written, such as length(crank).
+        name: name of the parameter, or "at" for the value of the driver.
+        low, high: range of the number, in `unit`.
+        unit: unit in which the number is shown.
+        size: the size of `unit` in the unit of the parameter.
     """
 
     title: str
@@ -56,7 +56,10 @@ class Exercise(NamedTuple):
     solution: WorkedSolution
 
     def answers(self) -> dict[str, float]:
-        """Return the answers: places, velocities and accelerations of pins, and the motion of links, in the drawing's units."""
+        """Return the answers by name, in the units of the drawing.
+
+        These are the places, velocities and accelerations of pins, and the angles, angular velocities and accelerations of links.
+        """
         found, motion, style = {}, self.solution.motion, self.solution.style
         for pin, values in motion.pins.items():
             for name, unit, (x, y) in zip(("", "v", "a"), ("m", "m/s", "m/s2"), np.asarray(values)[0], strict=True):
@@ -73,7 +76,7 @@ def read_variation(mechanism: Mechanism, text: str) -> Variation:
     """Return the varied number of a text, such as "length(crank) 35..45 mm", "number.r 30..50" or "at 20..70 deg".
 
     Raises:
-        SceneError: it cannot be read, or the drawing does not give the length of a link.
+        SceneError: the text cannot be read, or the drawing does not give the length of a link.
     """
     match, drawing = _RANGE.fullmatch(text), mechanism.drawing
     if match is None or not isinstance(drawing, Drawing):
@@ -99,7 +102,11 @@ def read_variation(mechanism: Mechanism, text: str) -> Variation:
 
 
 def _length_parameter(drawing: Drawing, link: str) -> str:
-    """Return the parameter that is the length of a bar."""
+    """Return the name of the parameter that is the length of a bar.
+
+    Raises:
+        SceneError: there is no such bar, or the drawing does not give its length.
+    """
     if link not in drawing.links:
         raise SceneError([f"vary: no link named {quote(link)}{suggestion(link, drawing.links)}"])
     groups = drawing.groups["pin"]
@@ -120,12 +127,14 @@ def _length_parameter(drawing: Drawing, link: str) -> str:
 def exercises(
     mechanism: Mechanism, vary: Sequence[Variation], students: Sequence[str], at: str, seed: int = 0, digits: int = 6
 ) -> Iterator[Exercise]:
-    """Iterate over exercises with other numbers for each student, which assemble, turn as the drawing does, and differ.
+    """Iterate over exercises with random numbers, different for each student, with which the mechanism works.
+
+    It works if it can be assembled and, if the driver of the drawing turns all the way round, turns all the way round, too.
 
     Args:
         mechanism: the drawing.
         vary: the numbers that differ.
-        students: their names.
+        students: names of the students.
         at: the value of the driver, unless it is varied.
         seed: the same seed gives the same numbers.
         digits: significant digits of printed numbers.
@@ -154,7 +163,10 @@ def exercises(
 
 
 def _drawn(rng: np.random.Generator, one: Variation, count: int) -> float:
-    """Return a number of a range, a multiple of 1, 2 or 5 times a power of ten."""
+    """Return a random number in the range of a variation: a multiple of 1, 2 or 5 times a power of ten.
+
+    `count` is the number of students, for whom there are enough such numbers.
+    """
     finest = (one.high - one.low) / (FINEST * max(count, 5))
     power = 10.0 ** np.floor(np.log10(finest))
     step = max(k * power for k in (1.0, 2.0, 5.0) if k * power <= finest * (1 + 1e-9))
@@ -176,7 +188,7 @@ def _tried(
 
 
 def write_exercises(name: str, found: Sequence[Exercise], vary: Sequence[Variation], folder: Path) -> list[Path]:
-    """Write a sheet and a solution for each student, and a table for the teacher; returns the files."""
+    """Write a sheet and a solution for each student, and a table of answers for the teacher; return the paths of the files."""
     folder.mkdir(parents=True, exist_ok=True)
     width, files = len(str(len(found))), []
     out = io.StringIO()
@@ -207,12 +219,15 @@ def _sheet(one: Exercise, name: str, given: dict[str, tuple[float, str]]) -> str
 def write_course(
     mechanism: Mechanism, vary: Sequence[str], students: Sequence[str], at: str, seed: int, folder: Path
 ) -> tuple[list[Exercise], list[Path]]:
-    """Write the exercises of all students to a folder, from the texts of the varied numbers; returns them and the files."""
+    """Write the exercises of all students to a folder; return the exercises, and the paths of the files.
+
+    The arguments are those of `exercises`, with the varied numbers as texts: see `read_variation`.
+    """
     variations = [read_variation(mechanism, text) for text in vary]
     found = list(exercises(mechanism, variations, students, at, seed))
     return found, write_exercises(mechanism.name, found, variations, folder)
 
 
 def _plain(name: str) -> str:
-    """Return a name that a spreadsheet does not take for a formula."""
+    """Return a name, with an apostrophe in front if a spreadsheet would take it for a formula."""
     return f"'{name}" if name.startswith(("=", "+", "-", "@")) else name

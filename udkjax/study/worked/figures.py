@@ -26,8 +26,8 @@ class PolygonSide(NamedTuple):
     """An arrow of a polygon, from one point to another, with its name.
 
     Attributes:
-        start, end: its ends (m/s, m/s^2).
-        name: a letter, and the index after an underscore.
+        start, end: ends of the arrow (m/s or m/s^2).
+        name: name of the arrow: a letter, and the index after an underscore.
         kind: "pole" from the pole to a pin, "relative" between two pins.
     """
 
@@ -38,7 +38,10 @@ class PolygonSide(NamedTuple):
 
 
 class _Frame:
-    """The map of a figure from coordinates to its units, the same along both axes; y points up."""
+    """The map from coordinates to the units of a figure, with the same scale along both axes; y points up.
+
+    `scale` is the ratio of lengths in the figure to lengths in coordinates; by default, the points fill the figure.
+    """
 
     def __init__(self, points: Sequence[np.ndarray], scale: float | None = None):
         low, high = np.min(points, axis=0), np.max(points, axis=0)
@@ -61,7 +64,7 @@ class _Frame:
 
 
 def drawing_figure(geometry: Geometry, style: NumberStyle, names: bool = True) -> str:
-    """Return the drawing in its position: links, slots, pins with their names, and the lengths of bars."""
+    """Return an SVG of the drawing in its position: links, slots, pins with their names and, if `names`, the lengths of bars."""
     drawing, places = geometry.drawing, _all_places(geometry)
     frame, parts = _Frame(list(places.values())), []
     for start, way, _ in geometry.lines.values():
@@ -107,7 +110,7 @@ def _all_places(geometry: Geometry) -> dict[str, np.ndarray]:
 
 
 def polygon_figure(sides: Sequence[PolygonSide], style: NumberStyle, unit: str, title: str) -> str:
-    """Return a polygon to scale, with a caption that says the scale."""
+    """Return a polygon to scale as HTML, with a caption that names the scale; a sentence if all arrows are zero."""
     points = [np.zeros(2), *(x for side in sides for x in (side.start, side.end))]
     size = float(np.max(np.ptp(points, axis=0)))
     if size == 0.0:
@@ -134,7 +137,7 @@ def _line(frame: _Frame, start: np.ndarray, end: np.ndarray, kind: str) -> str:
 
 
 def _beside(texts: TextPlaces, start: np.ndarray, end: np.ndarray, words: str) -> np.ndarray:
-    """Return the middle of a text beside a line."""
+    """Return the place of the middle of a text beside a line, where there is room."""
     way = end - start
     across = np.array([way[1], -way[0]]) / np.hypot(*way)
     off = CLEAR + 0.5 * (texts.width(words) * abs(across[0]) + LETTERS * abs(across[1]))

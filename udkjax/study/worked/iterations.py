@@ -30,9 +30,10 @@ class NewtonStep(NamedTuple):
 
 
 def newton_steps(loops: Sequence[VectorLoop], rates: PositionRates) -> list[NewtonStep]:
-    """Return the steps of Newton's method, J d = -f for the changes d of the unknowns, to the position of the rates.
+    """Return the steps of Newton's method, J d = -f for the changes d of the unknowns, to the position of `rates`.
 
-    f are the components x and y of the closures, and J is the matrix of the velocities. Empty if no estimate leads there.
+    f are the components x and y of the closures, and J is the matrix of the velocities. The first step begins at a coarse
+    estimate of the position. If no estimate leads to it, there are no steps.
     """
     names = [("angle", body) for loop in loops for body in loop.angles] + [("slide", s) for loop in loops for s in loop.slides]
     goal = np.array([(rates.angles if kind == "angle" else rates.slides)[name][0] for kind, name in names])
@@ -55,7 +56,7 @@ def newton_steps(loops: Sequence[VectorLoop], rates: PositionRates) -> list[Newt
 def _closures(
     loops: Sequence[VectorLoop], rates: PositionRates, unknowns: dict[tuple[str, str], float]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the components of the closures of loops, and their derivatives by the unknowns."""
+    """Return the components of the closures of loops (m), and their derivatives with respect to the unknowns."""
 
     def vector(x: LoopVector) -> tuple[float, float]:
         angle = 0.0 if x.body == GROUND else unknowns.get(("angle", x.body), rates.angles[x.body][0])

@@ -26,10 +26,10 @@ class LinearEquations(NamedTuple):
     """A linear system A x = b.
 
     Attributes:
-        matrix: the lines of its coefficients, by rows.
-        right: the lines of its right sides.
-        unknowns: the symbols, with the values that solve it.
-        lines: the solution.
+        matrix: the lines that define the coefficients in A, by rows.
+        right: the lines that define the entries of b.
+        unknowns: the symbols of x, with the values that solve the system.
+        lines: the lines of the solution.
     """
 
     matrix: list[list[EquationLine]]
@@ -44,12 +44,15 @@ class LinearEquations(NamedTuple):
 
 
 def velocity_system(symbols: PositionSymbols, loops: Sequence[VectorLoop]) -> LinearEquations:
-    """Return the linear system of the first derivatives of the unknowns of loops."""
+    """Return the linear system whose unknowns are the first derivatives of the unknowns of loops."""
     return _linear(symbols, loops, 1, lambda vector, axis: _velocity(symbols, vector, axis, loops))
 
 
 def acceleration_system(symbols: PositionSymbols, loops: Sequence[VectorLoop]) -> LinearEquations:
-    """Return the linear system of the second derivatives of the unknowns of loops; its matrix is that of the velocities."""
+    """Return the linear system whose unknowns are the second derivatives of the unknowns of loops.
+
+    Its matrix is that of the velocities.
+    """
     return _linear(symbols, loops, 2, lambda vector, axis: _acceleration(symbols, vector, axis, loops))
 
 
@@ -83,7 +86,7 @@ def _linear(symbols: PositionSymbols, loops: Sequence[VectorLoop], order: int, k
 
 
 def _of_angle(symbols: PositionSymbols, loop: VectorLoop, body: str, axis: int) -> SumOfTerms:
-    """Return the coefficient of the rate of an angle: the loop's vectors on the body, turned by a right angle."""
+    """Return the coefficient of the rate of a body's angle: the sum of the loop's vectors on the body after a quarter turn."""
     parts = []
     for x in loop.vectors:
         if x.body == body:
@@ -99,7 +102,7 @@ def _of_slide(symbols: PositionSymbols, loop: VectorLoop, slide: str, axis: int)
 def _velocity(
     symbols: PositionSymbols, vector: LoopVector, axis: int, loops: Sequence[VectorLoop]
 ) -> list[tuple[float, EquationTerm]]:
-    """Return the known parts of the velocity of a vector's end: r omega across it, and its change of length along it."""
+    """Return the known parts of a vector's rate along an axis: r omega across the vector, and its change of length along it."""
     sign, way = vector.sign, symbols.direction(vector)
     across = (-sign if axis == 0 else sign, of_angle(NAMES[1 - axis], way))
     found = []
@@ -113,7 +116,11 @@ def _velocity(
 def _acceleration(
     symbols: PositionSymbols, vector: LoopVector, axis: int, loops: Sequence[VectorLoop]
 ) -> list[tuple[float, EquationTerm]]:
-    """Return the known parts: tangential, along the line, Coriolis (2 times rate times omega), and towards the centre."""
+    """Return the known parts of a vector's second derivative along an axis, each with a sign.
+
+    These are the tangential part, the part along the line, the Coriolis part (2 times rate times omega), and the centripetal
+    part.
+    """
     sign, way, size = vector.sign, symbols.direction(vector), symbols.length(vector)
     along, across = of_angle(NAMES[axis], way), of_angle(NAMES[1 - axis], way)
     turned = -sign if axis == 0 else sign
@@ -148,7 +155,7 @@ def _cramer(matrix: list[list[EquationLine]], right: list[EquationLine], unknown
 
 
 def _put_in(matrix: list[list[EquationLine]], right: list[EquationLine], unknowns: list[NamedQuantity]) -> list[EquationLine]:
-    """Return the lines of the solution of linear equations, and each equation with this solution in it."""
+    """Return the lines of the solution of linear equations, and each equation with the solution put in."""
     rows = [
         total(*((1.0, ProductOfTerms((_left(a), x))) for a, x in zip(row, unknowns, strict=True) if a.right != NO_TERMS))
         for row in matrix

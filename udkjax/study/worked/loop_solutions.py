@@ -24,13 +24,13 @@ class LoopSolution(NamedTuple):
     """The solution of one loop, or of loops that are solved together.
 
     Attributes:
-        loops: their vectors.
+        loops: the loops, with their vectors.
         closures: the two components of the closure of each.
         shared: lines of the positions that all branches share.
         branches: the positions of the unknowns; empty if they follow by iteration alone.
         steps: steps of Newton's method from an estimate, where there is no closed form.
         found: the unknowns in this position.
-        velocity, acceleration: the linear systems of their derivatives.
+        velocity, acceleration: the linear systems of the first and second derivatives of the unknowns.
     """
 
     loops: list[VectorLoop]
@@ -43,7 +43,7 @@ class LoopSolution(NamedTuple):
     acceleration: LinearEquations
 
     def step_rows(self, style: NumberStyle) -> list[list[str]]:
-        """Return the table of the steps of Newton's method, with its heads; empty if there are none."""
+        """Return the table of the steps of Newton's method, whose first row has the heads; an empty list without steps."""
         heads = [f"{x.name} ({style.unit(x.unit)})" for x in self.found]
         rows = [
             [str(k), *(style.number(value, x.unit) for value, x in zip(step.unknowns, self.found, strict=True)),

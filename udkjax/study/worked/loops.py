@@ -24,11 +24,11 @@ class Connection(NamedTuple):
     """A joint of two bodies, with the name of its point.
 
     Attributes:
-        name: of the joint.
-        bodies: of which the first carries the line of a slot or slide.
-        pin: the point: a pin of the drawing.
-        slides: whether the point moves along a line of the first body.
-        turns: whether the bodies turn on each other.
+        name: name of the joint.
+        bodies: names of the two bodies; the first one carries the line of a slot or slide.
+        pin: name of the point, a pin of the drawing.
+        slides: True if the point moves along a line of the first body.
+        turns: True if the bodies turn on each other.
     """
 
     name: str
@@ -38,7 +38,7 @@ class Connection(NamedTuple):
     turns: bool
 
     def other(self, body: str) -> str:
-        """Return the other body."""
+        """Return the other one of the two bodies."""
         return self.bodies[1] if body == self.bodies[0] else self.bodies[0]
 
 
@@ -46,12 +46,12 @@ class LoopVector(NamedTuple):
     """A vector of a loop, from one point to another, in the direction of its own angle.
 
     Attributes:
-        start, end: names of points, in the direction of the angle.
-        sign: minus one where the loop runs against it.
-        body: the body whose angle its angle follows.
-        turn: its angle, from that of the body (rad).
-        size: its length (m).
-        slide: the joint along whose line it lies; its length then changes. Else "".
+        start, end: names of the points, in the direction of the vector.
+        sign: 1, or -1 where the loop runs against the vector.
+        body: the body with which the vector turns.
+        turn: angle of the vector relative to that of the body (rad).
+        size: length of the vector (m).
+        slide: name of the joint along whose line the vector lies, so that its length changes; "" if there is none.
     """
 
     start: str
@@ -108,7 +108,7 @@ class Geometry:
         return np.array([x + c * points[1][0] - s * points[1][1], y + s * points[1][0] + c * points[1][1]])
 
     def _line(self, joint: Connection) -> tuple[str, float, float]:
-        """Return the pin from which lengths along a line are counted, the angle of the line (rad), and its offset (m)."""
+        """Return the pin from which lengths along a joint's line are counted, the angle of the line (rad), and its offset (m)."""
         guide, place = joint.bodies[0], self.places[joint.pin]
         way = float(np.asarray(self.mechanism.joints[joint.name].axis)) + float(self.frames[guide][2])
         along = np.array([np.cos(way), np.sin(way)])
@@ -132,7 +132,11 @@ class Geometry:
         return body
 
     def within(self, body: str, start: str, end: str) -> list[LoopVector]:
-        """Return the vector between two pins of a body, none if they coincide, in the order of the drawing's pins."""
+        """Return a list with the vector between two pins of a body; an empty list if the pins coincide.
+
+        The vector runs from `end` to `start`, with the sign -1, if it is then along its body or, on the ground, at most 90
+        degrees from x.
+        """
         arm = self.places[end] - self.places[start]
         size = float(np.hypot(*arm))
         if size <= NOTHING * self.extent:
@@ -160,7 +164,7 @@ class Geometry:
         return found if sign > 0 else found[::-1]
 
     def chain(self, body: str, entry: Connection, leave: Connection) -> list[LoopVector]:
-        """Return the vectors of a loop within a body, from the joint by which it enters to that by which it leaves."""
+        """Return the vectors of a loop within a body, from the joint `entry`, at which the loop enters, to the joint `leave`."""
         before, after, start, end = [], [], entry.pin, leave.pin
         if entry.slides and entry.bodies[0] == body:
             start, before = self.lines[entry.name][0], self.along(entry, -1.0)
@@ -194,7 +198,10 @@ def _connections(mechanism: Mechanism, drawing: Drawing) -> Iterator[Connection]
 
 
 def loops_of(geometry: Geometry) -> list[list[VectorLoop]]:
-    """Return the loops in an order in which each determines two unknowns; where none does, the fewest that do so together."""
+    """Return lists of loops that are solved in this order, the loops of each list together.
+
+    A list has a single loop if this determines two unknowns; where no loop does, it has the fewest loops that do so together.
+    """
     known_bodies, known_slides = _driven(geometry)
     bodies, found = list(geometry.mechanism.body_names), []
     used = {joint.name for joint in geometry.connections if set(joint.bodies) <= known_bodies}
@@ -218,7 +225,10 @@ def loops_of(geometry: Geometry) -> list[list[VectorLoop]]:
 
 
 def _smallest_group(geometry: Geometry, known: set[str]) -> set[str]:
-    """Return the fewest bodies that their joints among each other and to known ones hold, an Assur group; or all, of many."""
+    """Return the smallest set of unknown bodies that are held by joints with each other and with known bodies, an Assur group.
+
+    All unknown bodies are returned if there is no smaller set, or if there are too many bodies to search.
+    """
     unknown = [body for body in geometry.mechanism.body_names if body not in known]
     for count in range(2, len(unknown) if len(unknown) <= MOST_SEARCHED else 2):
         for group in map(set, itertools.combinations(unknown, count)):
@@ -229,7 +239,11 @@ def _smallest_group(geometry: Geometry, known: set[str]) -> set[str]:
 
 
 def _driven(geometry: Geometry) -> tuple[set[str], set[str]]:
-    """Return the bodies whose motion the driver gives, and the slides."""
+    """Return the names of the bodies whose motion the driver gives, with the ground, and of the slides whose motion it gives.
+
+    Raises:
+        SceneError: the driver is of another kind.
+    """
     driven = geometry.driven
     moving = [body for body in driven.bodies if body != GROUND]
     joints = [joint for joint in geometry.connections if set(joint.bodies) == set(driven.bodies)]
@@ -247,7 +261,7 @@ BodyPath = list[tuple[str, Connection]]  # bodies, each with the joint by which 
 
 
 def _paths(geometry: Geometry, known: set[str], allowed: set[str]) -> Iterator[BodyPath]:
-    """Iterate over the chains of allowed unknown bodies between two joints of known ones."""
+    """Iterate over the chains of unknown bodies, out of those allowed, that begin and end at known bodies."""
 
     def onward(path: BodyPath, body: str) -> Iterator[BodyPath]:
         visited = {name for name, _ in path}
@@ -296,7 +310,7 @@ def _shortest(geometry: Geometry, start: str, goal: str, used: set[str]) -> Body
 
 
 def _together(geometry: Geometry, known: set[str], slides: set[str], used: set[str], group: set[str]) -> list[VectorLoop]:
-    """Return independent loops of a group of bodies, with their unknowns at the first one."""
+    """Return independent loops of a group of bodies; each unknown belongs to the first loop that contains it."""
     joined, slides = set(known), set(slides)
     found: list[VectorLoop] = []
     basis: dict[int, int] = {}

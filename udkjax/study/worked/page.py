@@ -14,7 +14,7 @@ from udkjax.study.worked.terms import EquationLine, NamedQuantity, NumberStyle
 
 
 def document(title: str, body: str) -> str:
-    """Return a page with a title and the style of worked solutions."""
+    """Return an HTML page with a title, a body, and the style of worked solutions."""
     style = (Path(__file__).parent / "page.css").read_text(encoding="utf-8")
     head = f'<meta charset="utf-8"><meta name="viewport" content="width=device-width"><title>{escape(title)}</title>'
     return f'<!doctype html>\n<html lang="en"><head>{head}<style>{style}</style></head><body>\n{body}\n</body></html>\n'
@@ -100,7 +100,7 @@ def _equation(line: EquationLine, style: NumberStyle) -> str:
 def _system(
     matrix: Sequence[Sequence[EquationLine]], unknowns: Sequence[NamedQuantity], right: Sequence[EquationLine], style: NumberStyle
 ) -> str:
-    """Return a linear system as matrices."""
+    """Return a linear system as matrices in MathML."""
 
     def column(rows: Sequence[Sequence[str]]) -> str:
         inner = "".join(f"<mtr>{''.join(f'<mtd>{cell}</mtd>' for cell in row)}</mtr>" for row in rows)

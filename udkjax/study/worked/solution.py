@@ -40,7 +40,7 @@ class WorkedSolution:
         loops: the solutions of the loops, in order.
         motion: the motion of all pins and links.
         polygons: the arrows of the polygons of velocities (m/s) and of accelerations (m/s^2).
-        balances: by link, the equations of its equilibrium under the loads; empty without loads.
+        balances: the equations of equilibrium of each link under the loads, by name; empty without loads.
         style: the units and the digits of numbers.
         geometry: pins, lines and angles in this position.
         symbols: the symbols, with their values.
@@ -79,7 +79,7 @@ class WorkedSolution:
         return f"WorkedSolution({self.title!r}, {len(self.lines)} equations)"
 
     def html(self) -> str:
-        """Return the solution as a page, typeset by MathML, which also prints."""
+        """Return the solution as an HTML page with formulas in MathML, which can be printed."""
         return page_of(self.title, self.geometry, self.style, self.loops, self.motion, self.polygons, self.balances)
 
     def save(self, path: str | Path) -> None:
@@ -99,7 +99,7 @@ def worked_solution(mechanism: Mechanism, at: NumberLike | str, digits: int = 6,
         mechanism: a drawn mechanism with one motor: of a link about a pin of the ground, or of a slide on the ground.
         at: the value of the motor, in the unit of the drawing, or a text with a unit, such as "40 deg".
         digits: significant digits of printed numbers.
-        forces: whether to add the static equilibrium of each link, if there are loads and each link has a mass, or no weight.
+        forces: True to add the static equilibrium of each link, if there are loads and, with gravity, each link has a mass.
 
     Returns:
         The `WorkedSolution`.
@@ -136,7 +136,7 @@ def worked_solution(mechanism: Mechanism, at: NumberLike | str, digits: int = 6,
 
 
 def _slide(geometry: Geometry, name: str, v: np.ndarray, a: np.ndarray) -> tuple[float, float, float]:
-    """Return the length along a line, from the pin from which it is counted, and its first and second derivative in time."""
+    """Return the length along a joint's line, from the pin from which it is counted, and its first two derivatives in time."""
     joint = next(one for one in geometry.connections if one.name == name)
     start, way, _ = geometry.lines[name]
     rates = dict(zip(geometry.mechanism.body_names, zip(v, a, strict=True), strict=True)) | {GROUND: (np.zeros(3), np.zeros(3))}
@@ -151,7 +151,10 @@ def _slide(geometry: Geometry, name: str, v: np.ndarray, a: np.ndarray) -> tuple
 
 
 def _point_motion(geometry: Geometry, rates: Mapping[str, Any], body: str, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return velocity and acceleration of the point of a body at a place."""
+    """Return velocity and acceleration of the point of a body that is at a place.
+
+    `rates` are velocities and accelerations (x, y, angle) of bodies, by name.
+    """
     v, a = rates[body]
     arm = place - np.asarray(geometry.frames[body])[:2]
     side = np.array([-arm[1], arm[0]])
@@ -159,7 +162,10 @@ def _point_motion(geometry: Geometry, rates: Mapping[str, Any], body: str, place
 
 
 def _polygon(geometry: Geometry, motion: PinMotion, order: int) -> list[PolygonSide]:
-    """Return the polygon of velocities or accelerations: each pin's from the pole, and between the pins of each link."""
+    """Return the arrows of the polygon of velocities (`order` 1) or of accelerations (2).
+
+    There are arrows from the pole for each pin, and between the pins of each link.
+    """
     drawing = geometry.drawing
     vectors = {pin: np.asarray(x)[0, order] for pin, x in motion.pins.items()}
     largest = max((float(np.hypot(*x)) for x in vectors.values()), default=0.0)

@@ -1,4 +1,4 @@
-"""Symbols of a position, and the components of vectors in them."""
+"""Symbols of a position, and components of vectors that are written in these symbols."""
 
 from udkjax.scene.elements.bodies import GROUND
 from udkjax.study.worked.iterations import PositionRates
@@ -23,12 +23,12 @@ class PositionSymbols:
         self.rates, self.pins = rates, pins_of_slides
 
     def angle(self, body: str, order: int = 0) -> NamedQuantity:
-        """Return the angle of a body, its angular velocity or its angular acceleration."""
+        """Return the angle of a body (`order` 0), its angular velocity (1) or its angular acceleration (2)."""
         letter, unit = (("θ", "rad"), ("ω", "rad/s"), ("α", "rad/s2"))[order]
         return NamedQuantity(letter, body, self.rates.angles[body][order], unit)
 
     def length(self, vector: LoopVector, order: int = 0) -> NamedQuantity:
-        """Return the length of a vector; for one along a line also its derivatives."""
+        """Return the length of a vector, or its derivative of an `order`, which may be 1 or 2 for a vector along a line."""
         if not vector.slide:
             return NamedQuantity("r", vector.start + vector.end, vector.size, "m")
         return NamedQuantity(
@@ -36,7 +36,7 @@ class PositionSymbols:
         )
 
     def direction(self, vector: LoopVector) -> EquationTerm:
-        """Return the angle of a vector: that of its body, plus a constant one."""
+        """Return the angle of a vector: the angle of its body plus a constant angle."""
         if vector.body == GROUND:
             return NamedQuantity("φ", vector.start + vector.end, vector.turn, "rad")
         angle = self.angle(vector.body)
@@ -49,11 +49,11 @@ class PositionSymbols:
 
 
 def component(symbols: PositionSymbols, vector: LoopVector, axis: int) -> EquationTerm:
-    """Return the component of a vector along x or y."""
+    """Return the component of a vector along x (`axis` 0) or y (1)."""
     return ProductOfTerms((symbols.length(vector), of_angle(NAMES[axis], symbols.direction(vector))))
 
 
 def defined(letter: str, index: str, right: EquationTerm, unit: str) -> tuple[NamedQuantity, EquationLine]:
-    """Return a symbol with the value of a right side, and the line that defines it."""
+    """Return a symbol with the value of the term `right`, and the line that defines the symbol by this term."""
     found = NamedQuantity(letter, index, right.value, unit)
     return found, EquationLine(right, found)

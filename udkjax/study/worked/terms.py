@@ -25,13 +25,13 @@ class NumberStyle(NamedTuple):
     digits: int = 6
 
     def size(self, unit: str) -> float:
-        """Return the size of the shown unit in an SI unit; a unit may be a product, "m2", or "rad" for an angle."""
+        """Return the size of the shown unit in the SI unit `unit`, which may be a product such as "m2", or "rad" for an angle."""
         length = self.units.size("m")
         sizes = {"rad": np.pi / 180, "m2": length**2, "m3": length**3, "m/s2": length, "N m": 1.0, "rad/s": 1.0}
         return sizes.get(unit, length if unit in ("m", "m/s") else 1.0)
 
     def unit(self, unit: str) -> str:
-        """Return the name of the shown unit."""
+        """Return the name of the unit in which a quantity with the SI unit `unit` is shown."""
         length = self.units.shown("m")
         names = {
             "rad": "°",
@@ -45,7 +45,7 @@ class NumberStyle(NamedTuple):
         return names.get(unit, unit)
 
     def number(self, value: float, unit: str) -> str:
-        """Return a number in SI units as digits, in the shown unit."""
+        """Return the digits of a value in the shown unit; `value` is in the SI unit `unit`."""
         text = f"{float(value) / self.size(unit):.{self.digits}g}"
         return "0" if float(text) == 0.0 else text
 
@@ -131,7 +131,7 @@ class SumOfTerms(EquationTerm):
 
     @property
     def scale(self) -> float:
-        """The largest of the terms."""
+        """The largest absolute value of a term; 0 without terms."""
         return max((abs(term.value) for _, term in self.parts), default=0.0)
 
     def text(self, style, numbers=True):
@@ -201,7 +201,7 @@ class SquaredTerm(EquationTerm):
 
 @dataclass(frozen=True)
 class AppliedFunction(EquationTerm):
-    """cos, sin, sqrt, acos or atan2 of terms."""
+    """A function of terms: cos, sin, sqrt, acos or atan2."""
 
     name: str
     given: tuple[EquationTerm, ...] = field(default=())
@@ -282,9 +282,9 @@ class EquationLine(NamedTuple):
     """An equation: `left` equals `right`; without a left side, `right` is zero.
 
     Attributes:
-        right: its right side.
-        left: the symbol on its left side.
-        words: an explanation.
+        right: the right side.
+        left: the symbol on the left side; None if the equation is right = 0.
+        words: an explanation, or "".
     """
 
     right: EquationTerm
@@ -293,7 +293,7 @@ class EquationLine(NamedTuple):
 
     @property
     def residual(self) -> float:
-        """The difference of the two sides, relative to the largest of them or of their terms."""
+        """The difference of the two sides, relative to the largest of these or of the terms of a sum."""
         left = 0.0 if self.left is None else self.left.value
         difference = abs(left - self.right.value)
         scale = max(abs(left), self.right.scale if isinstance(self.right, SumOfTerms) else abs(self.right.value))
@@ -311,7 +311,7 @@ class EquationLine(NamedTuple):
         return f"{self.left.name} = {right}{result}"
 
     def _pieces(self, style: NumberStyle, numbers: bool, before: str = "") -> list[str]:
-        """Return the right side with numbers or symbols, a piece for each term of a sum."""
+        """Return the right side in MathML, with numbers or symbols, a piece for each term of a sum; `before` begins the first."""
         if not isinstance(self.right, SumOfTerms):
             return [f"{before}{self.right.mathml(style, numbers)}"]
         pieces = []
@@ -341,7 +341,7 @@ class EquationLine(NamedTuple):
 
 
 def _wrapped(pieces: Sequence[str]) -> str:
-    """Return pieces of a formula, between which a line may break."""
+    """Return an equation in HTML from pieces of a formula, between which a line may break."""
     inner = " ".join(f'<math displaystyle="true"><mrow>{piece}</mrow></math>' for piece in pieces)
     return f'<div class="equation">{inner}</div>'
 

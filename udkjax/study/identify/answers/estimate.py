@@ -115,7 +115,7 @@ class Estimate:
 
     @property
     def parameters(self) -> dict[str, float]:
-        """The values by name."""
+        """The identified values by name."""
         return dict(zip(self.names, self.values.tolist(), strict=True))
 
     @property
@@ -125,7 +125,7 @@ class Estimate:
 
     @cached_property
     def initial_states(self) -> tuple[State, ...]:
-        """The closed initial states of the records."""
+        """The closed initial states of the records at the estimate."""
         return self.problem.first_states(self._with_values, self.z)
 
     @property
@@ -242,7 +242,7 @@ class Estimate:
     # --- as a table
 
     def rows(self) -> list[Row]:
-        """Return one row per parameter, followed by those of initial states."""
+        """Return one row per parameter, followed by one row per unknown of an initial state."""
         uncertainty, guess = self.uncertainty, self.problem.unknowns.guess
         notes = [uncertainty.notes(name) + (["at a bound"] if name in self.at_bounds else []) for name in self.names]
         errors = uncertainty.standard_errors.tolist()

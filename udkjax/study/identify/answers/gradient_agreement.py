@@ -1,4 +1,4 @@
-"""Agreement of derivatives with finite differences: where they agree, and what is said where they do not."""
+"""Agreement of derivatives with finite differences: its measures, the verdict, and messages about disagreement."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -20,7 +20,7 @@ USEFUL_PRECISION = 0.1  # largest floor, relative to the derivative, at which ag
 
 
 class DisagreementPlace(NamedTuple):
-    """The time (s) at which a derivative and its difference (channel units per unit of z) disagree most."""
+    """The time (s) at which a derivative and its difference disagree most, and both (in channel units per unit of z)."""
 
     record: int
     channel: str
@@ -76,16 +76,16 @@ class GradientCheck:
 
     @property
     def agrees(self) -> Bool[np.ndarray, "D S"]:
-        """True for each direction and series if the discrepancy is at most `AGREEMENT` floors."""
+        """Mask of the directions and series in which the discrepancy is at most `AGREEMENT` times the floor."""
         return self.ratio <= AGREEMENT
 
     @cached_property
     def best(self) -> Int[np.ndarray, "D S"]:
-        """Index of the step with the most accurate differences; -1 if all failed."""
+        """Index of the step with the most accurate differences; -1 if no step has a known error."""
         return best_steps(self.noise + self.truncation)
 
     def at_best(self, values: Float[np.ndarray, "D S H"]) -> Float[np.ndarray, "D S"]:
-        """Return the values at the best step."""
+        """Return the values at the best step of each direction and series; NaN where there is no best step."""
         best_values = np.take_along_axis(values, np.maximum(self.best, 0)[..., None], -1)[..., 0]
         return np.where(self.best < 0, np.nan, best_values)
 
@@ -101,7 +101,7 @@ class GradientCheck:
 
     @property
     def ratio(self) -> Float[np.ndarray, "D S"]:
-        """The least ratio of the discrepancy to the floor, of the steps that are about as accurate as the best; NaN if unknown.
+        """The least ratio of the discrepancy to the floor among the steps that are about as accurate as the best; NaN if unknown.
 
         A derivative that is wrong is wrong at all of these steps, while a difference may be off at one of them.
         """
@@ -142,7 +142,7 @@ def _sentences(check: GradientCheck) -> list[str]:
 
 
 def _sentence(check: GradientCheck, d: int, s: int) -> str:
-    """Return a sentence about a problem in a direction and a series; empty if there is no problem."""
+    """Return a sentence about the problem in direction d and series s; "" if there is no problem."""
     floor, size = check.floor[d, s], check.size[d, s]
     if np.isnan(check.noise[d, s]).all():
         return "cannot be compared, since runs with nearby values fail"

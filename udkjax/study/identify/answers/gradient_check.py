@@ -60,7 +60,7 @@ def check_gradients(
     """Compare the derivatives that `identify` uses with finite differences, at the first guess of the parameters.
 
     The directions are each unknown by itself, so that each entry of the Jacobian is compared, and some random combinations; in
-    each direction, the mechanism is closed and simulated forty times. Of second order, the second derivative of the predicted
+    each direction, the mechanism is closed and simulated forty times. With `order=2`, the second derivative of the predicted
     values along each direction is compared with differences of the first one: d^T H d with the Hessian H of each value. Memory
     holds a block of rows of the Jacobian, however long the records are. For the same check at an estimate, see
     `Estimate.check_gradients`.
@@ -131,7 +131,11 @@ def compare_gradients(
 
 
 def _completed_tol(problem: FitProblem, z: Float[np.ndarray, "K"], tols: Sequence[TolerancePair]) -> TolerancePair:
-    """Return the first of the tolerances at which all runs are completed."""
+    """Return the first of some tolerances at which all runs are completed and all channels are finite.
+
+    Raises:
+        IdentificationError: there is no such tolerance.
+    """
     code = Result.successful
     for tol in tols:
         found = [(int(block.code[0]), np.isfinite(block.r[0]).all()) for block in problem.row_blocks(z[None], tol)]
@@ -145,7 +149,7 @@ def _completed_tol(problem: FitProblem, z: Float[np.ndarray, "K"], tols: Sequenc
 def _slopes(
     problem: FitProblem, z: Float[np.ndarray, "K"], directions: Float[np.ndarray, "D K"], tols: Sequence[TolerancePair]
 ) -> Float[np.ndarray, "D tols R"]:
-    """Return J d for some directions, at each of the tolerances, in the units of channels."""
+    """Return J d for each of some directions d at each of the tolerances, in the units of the channels."""
     slopes = np.zeros((len(directions), len(tols), len(problem.index)))
     for k, tol in enumerate(tols):
         for block in problem.row_blocks(z[None], tol):
@@ -157,7 +161,7 @@ def _slopes(
 def _curvatures(
     problem: FitProblem, z: Float[np.ndarray, "K"], directions: Float[np.ndarray, "D K"], tols: Sequence[TolerancePair]
 ) -> Float[np.ndarray, "D tols R"]:
-    """Return the second derivatives of the predicted values along some directions, in the units of channels."""
+    """Return the second derivatives of the predicted values along each direction at each tolerance, in the units of channels."""
     return np.stack([[problem.second_derivatives(z, d, tol) for tol in tols] for d in directions])
 
 
@@ -170,7 +174,10 @@ def _compare(
     series: Sequence[np.ndarray],
     order: int,
 ) -> Differences:
-    """Compare derivatives along a direction with differences, in blocks of rows."""
+    """Return differences along the direction d, compared with the derivatives `slopes` along it at the first of two tolerances.
+
+    The second tolerance gives the integration errors. With `order` 2, derivatives of first order are differenced.
+    """
     along = d if order == 2 else None
     series_of = np.full(len(problem.index), -1)
     series_of[np.concatenate(series)] = np.repeat(np.arange(len(series)), [len(rows) for rows in series])

@@ -1,8 +1,9 @@
 """Joint confidence regions of two parameters: an ellipse by their covariance, and a curve by their profile likelihood.
 
-The region has all values of the two at which the cost of the fit of all others rises by less than the quantile of chi^2 with two
-degrees of freedom (of 2 F, for estimated noise). Its edge is searched on rays from the estimate, which are equally spaced where
-the ellipse is a circle: in a linear model, the edge is the ellipse.
+The region contains all pairs of values for which twice the cost, minimized over all other unknowns and relative to the noise,
+exceeds its minimum by less than the quantile of chi^2 with two degrees of freedom (of 2 F, for estimated noise). Its edge is
+searched on rays from the estimate, which are equally spaced in the coordinates in which the ellipse is a circle: in a linear
+model, the edge is the ellipse.
 """
 
 from collections.abc import Sequence
@@ -69,7 +70,19 @@ def joint_profile(
     names: tuple[str, str],
     level: float = CONFIDENCE,
 ) -> JointProfile:
-    """Search the edge of the joint confidence region of two parameters around an estimate z."""
+    """Return the joint confidence region of two parameters, whose edge is searched around an estimate z.
+
+    Args:
+        evaluate: the weighted residuals as a function of the unknowns.
+        unknowns: the parameters of the fit.
+        z: the unknowns at the estimate (K,).
+        uncertainty: the uncertainty of the estimate.
+        names: names of the two parameters.
+        level: confidence level.
+
+    Raises:
+        IdentificationError: a parameter was not identified, is the same as the other, or is not determined by the records.
+    """
     require_two(names, unknowns.names)
     errors = dict(zip(uncertainty.names, uncertainty.standard_errors, strict=True))
     if lost := [name for name in names if not np.isfinite(errors[name])]:
@@ -88,7 +101,10 @@ def joint_profile(
         return z
 
     def ends(along: Float[np.ndarray, "2"]) -> tuple[float, float]:
-        """Return the distances to both ends of a line through the estimate, in standard errors."""
+        """Return the distances to the edge in both directions along a line through the estimate; infinite where it is open.
+
+        Distances are relative to `along`, changes of the two unknowns by one standard deviation.
+        """
 
         def fit(index: int, distance: float, start: np.ndarray) -> tuple[np.ndarray, float]:
             there = moved(z, distance, along)
@@ -115,7 +131,7 @@ def joint_profile(
 
 
 def require_two(names: tuple[str, str], known: Sequence[str]) -> None:
-    """Require two different parameters.
+    """Require that two names are different, and that both are names of identified parameters.
 
     Raises:
         IdentificationError: a parameter was not identified, or is the same as the other.
@@ -133,7 +149,7 @@ def _circle(count: int) -> Float[np.ndarray, "N 2"]:
 
 
 def _root(covariance: Float[np.ndarray, "2 2"]) -> Float[np.ndarray, "2 2"]:
-    """Return the lower triangular root of a covariance, which may be singular to rounding."""
+    """Return the lower triangular root of a covariance, whose correlation may be 1 or beyond by rounding."""
     one, other = np.sqrt(np.diag(covariance))
     rho = covariance[0, 1] / (one * other)
     return np.array([[one, 0.0], [rho * other, np.sqrt(max(1.0 - rho**2, 0.0)) * other]])

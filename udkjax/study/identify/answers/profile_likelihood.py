@@ -1,6 +1,6 @@
 """The profile likelihood of an unknown: the rise of the cost as the unknown varies and all others are refitted.
 
-With C(z) = r.r / 2, an unknown z_k fixed and the others refitted, the curve
+With C(z) = r.r / 2, z_k an unknown that is fixed while all others are refitted, and s the noise, the curve
 
     psi = +-(2 (C(z_k) - C_min) / s^2)^(1/2)
 
@@ -39,12 +39,12 @@ FitOthers: TypeAlias = Callable[[int, float, np.ndarray], tuple[np.ndarray, floa
 
 
 class ProfileLikelihood(NamedTuple):
-    """The curve of an unknown, from its smallest value to its largest, and the confidence interval.
+    """The profile likelihood of a parameter: refitted costs over its values in increasing order, and a confidence interval.
 
     Attributes:
         name: name of the parameter.
         values: values x of the parameter.
-        costs: costs r.r / 2 of the fits of all others.
+        costs: costs r.r / 2 of the fits of all other unknowns.
         z: all unknowns of these fits.
         interval: confidence interval; an end is infinite if the curve does not rise to the limit.
         best: index of the lowest cost: that of the estimate, unless a better fit was found.
@@ -64,13 +64,13 @@ class ProfileLikelihood(NamedTuple):
 
 
 class _Side(NamedTuple):
-    """One side of a profile."""
+    """One side of a profile, from the estimate outwards."""
 
     fixed: list[float]  # values of z_k
     z: list[np.ndarray]  # all unknowns
     costs: list[float]
     end: float  # end of the interval
-    open: str  # the reason if the interval is open, else empty
+    open: str  # the reason if the interval is open on this side, else ""
 
 
 def fix_unknown(evaluate: Objective, index: int, value: float) -> Objective:
@@ -121,7 +121,7 @@ def residual_cost(blocks: Iterable[Residuals]) -> float:
 
 
 def estimated_noise(uncertainty: Uncertainty) -> tuple[float, float | None]:
-    """Return the noise relative to the assumed noise, and the degrees of freedom if it was estimated.
+    """Return the ratio of the estimated to the assumed noise, and its degrees of freedom; 1 and None if all noise was given.
 
     If the noise of several channels was estimated, residuals were divided by it, and the factors are 1 up to rounding.
     """
@@ -132,7 +132,7 @@ def estimated_noise(uncertainty: Uncertainty) -> tuple[float, float | None]:
 def profiles_dataset(
     profiles: Sequence[ProfileLikelihood], values: Mapping[str, float], uncertainty: Uncertainty, level: float = CONFIDENCE
 ) -> "xarray.Dataset":
-    """Return profile likelihoods of parameters with these values as a dataset: see `Estimate.to_xarray`."""
+    """Return profile likelihoods as a dataset (see `Estimate.to_xarray`); `values` are the estimates of parameters, by name."""
     with OptionalImport():
         import xarray
     noise, freedom = estimated_noise(uncertainty)
@@ -173,17 +173,23 @@ def trace_profile(
     units: str = "",
     steps: int = MOST_FITS,
 ) -> ProfileLikelihood:
-    """Walk from an estimate z with cost r.r / 2 in both directions along the unknown `index`, to the ends of its interval.
+    """Trace the profile likelihood of the unknown `index` from an estimate z in both directions, to the ends of its interval.
 
     Args:
         fit: (index, value, z0) -> (z, cost) minimizes the cost over all other unknowns, starting from z0; the walk ends before a
             failed fit, whose cost is not finite.
         index: index of the unknown.
+        z: unknowns at the estimate (K,).
+        cost: cost r.r / 2 at the estimate.
         step: standard error of the unknown, approximately.
+        level: confidence level.
         noise: ratio of the estimated to the assumed noise.
         degrees_of_freedom: degrees of freedom of the estimated noise, for the quantile of F; None if the noise is known.
         count: number of parameters that the interval is for; more than one for a ray of a joint region.
+        bounds: least and largest value of z_k.
         value: x as a function of z_k, increasing between the `bounds` of z_k.
+        name: name of the parameter in the result.
+        units: units of the parameter in the text.
         steps: maximum number of fits on each side.
     """
     limit = quantile(level, degrees_of_freedom, count)
@@ -207,13 +213,20 @@ def trace_profile(
 
 
 def quantile(level: float, degrees_of_freedom: float | None, count: int = 1) -> float:
-    """Return psi^2 at the ends: the quantile of chi^2 with `count` degrees of freedom, or that of F for estimated noise."""
+    """Return psi^2 at the ends of a confidence interval of `count` parameters.
+
+    It is the quantile of chi^2 with `count` degrees of freedom; for noise estimated with `degrees_of_freedom`, `count` times that
+    of F.
+    """
     known = degrees_of_freedom is None
     return float(chdtri(count, 1.0 - level) if known else count * fdtri(count, degrees_of_freedom, level))
 
 
 def _walk(fit: FitOthers, index: int, z: np.ndarray, cost: float, step: float, bound: float, rise: float, steps: int) -> _Side:
-    """Walk along one side by steps that raise psi equally; beyond the end, search between the two points around it."""
+    """Return one side of a profile, by steps that raise psi equally; beyond the end, search between the two points around it.
+
+    `step` is the signed distance to the expected end, where psi^2 is `rise`.
+    """
     end, sign = np.sqrt(rise), np.sign(step)
     inside: tuple[np.ndarray, float] = z, 0.0  # the last point inside the interval, and its psi
     previous, outside = None, None  # the previous point inside; the nearest point outside
@@ -265,7 +278,7 @@ def _walk(fit: FitOthers, index: int, z: np.ndarray, cost: float, step: float, b
 
 
 def _text(name: str, units: str, level: float, ends: tuple[float, float], sides: tuple[_Side, _Side], value: Callable) -> str:
-    """Return the interval in words; if it is open, with the limits of the search."""
+    """Return the interval in words; if it is open, with the limits of the search. `value` maps z_k to x."""
     unit = f" {units}" if units else ""
     if np.isfinite(ends).all():
         low, high = (f"{end:.{_digits(ends)}g}" for end in ends)

@@ -48,12 +48,16 @@ class UnknownValues(NamedTuple):
     kinds: Sequence[str]
 
     def typical(self, k: int) -> float:
-        """Return the scales to compare standard errors with: the value, or the scale of a parameter of either sign."""
+        """Return the size to compare the standard error of the k-th unknown with: its value, or the scale of a free one."""
         return float(abs(self.x[k]) or abs(self.dx_dz[k])) if self.kinds[k] == "bounded" else float(abs(self.dx_dz[k]))
 
 
 class Direction(NamedTuple):
-    """A change of unknowns that affects no measured quantity: coefficients in z (N,), and a description."""
+    """A change of unknowns that affects no measured quantity.
+
+    `names` are those of the N unknowns that change, `coefficients` their changes in z relative to the largest, and `text`
+    describes the change.
+    """
 
     names: tuple[str, ...]
     coefficients: Float[np.ndarray, "N"]
@@ -68,7 +72,7 @@ class Uncertainty:
         values: all K unknowns at the estimate.
         standard_errors: standard errors of the parameters, in their units; inf for undetermined parameters.
         covariance: covariance of the parameters; NaN for undetermined ones.
-        correlation: correlation of their errors.
+        correlation: correlation of the parameters' errors.
         singular: singular values of J over all unknowns z.
         directions: right singular vectors of J.
         dead: parameters that no measured quantity depends on.
@@ -77,7 +81,8 @@ class Uncertainty:
         degrees_of_freedom: number of residuals minus number of determined directions.
         noise: for each group of residuals with unknown noise, its estimate relative to the assumed noise.
         rows: number of residuals.
-        projector: W; U = J W, with J divided by the noise, spans the part of the measured residuals that the fit removes.
+        projector: W. The columns of U = J W, with J divided by the noise, are an orthonormal basis of the part of the measured
+            residuals that the fit removes.
         state_errors: standard errors of the unknowns of initial states.
     """
 
@@ -113,7 +118,7 @@ class Uncertainty:
         return self.correlated_beyond(HIGH_CORRELATION)
 
     def correlated_beyond(self, least: float) -> tuple[tuple[str, str, float], ...]:
-        """Return pairs of parameters whose errors have a larger correlation than this, of either sign, and the correlation."""
+        """Return pairs of parameters whose errors have a correlation larger than `least`, of either sign, and the correlation."""
         with np.errstate(invalid="ignore"):
             pairs = np.argwhere(np.triu(np.abs(self.correlation) > least, 1))
         return tuple((self.names[i], self.names[j], float(self.correlation[i, j])) for i, j in pairs)
@@ -188,7 +193,8 @@ def _with_priors(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return sigma, vt and `shown` with the directions that only priors determine.
 
-    A direction is determined if its singular value in the rows of the priors exceeds a share of their size.
+    A direction is determined if its singular value in the rows of the priors exceeds `INVISIBLE_RATIO` times the largest of these
+    rows.
     """
     unshown = null_space(vt[shown], 0.5)
     if not len(unshown) or not len(prior_rows):
@@ -206,7 +212,11 @@ def _insert_columns(rows: np.ndarray, columns: np.ndarray, count: int) -> np.nda
 
 
 def _noise_scales(reduced: Sequence[Reduction], alive: np.ndarray) -> np.ndarray:
-    """Return the factor s of each group of residuals; NaN for a group with no more residuals than unknowns that it determines."""
+    """Return the ratio of the estimated to the assumed noise of each group of residuals with unknown noise.
+
+    It is NaN for a group with no more residuals than unknowns that it determines. `alive` are the indices of the unknowns on
+    which residuals depend; the last item of `reduced` has the residuals with known noise.
+    """
     groups, factors = reduced[:-1], [group.J[:, alive] for group in reduced]
     sums, counts = np.array([group.r @ group.r for group in groups]), np.array([group.count for group in groups], float)
     s2 = sums / np.maximum(counts, 1.0)
@@ -226,7 +236,10 @@ def _noise_scales(reduced: Sequence[Reduction], alive: np.ndarray) -> np.ndarray
 def simplest_basis(
     free: Float[np.ndarray, "D K"], x: Float[np.ndarray, "K"], dx_dz: Float[np.ndarray, "K"], kinds: Sequence[str]
 ) -> Float[np.ndarray, "D K"]:
-    """Return sparse rows with the span of the orthonormal rows `free`; the first is a common factor if the span contains it."""
+    """Return sparse rows with the span of the orthonormal rows `free`.
+
+    If the span contains the direction that changes all positive and bounded unknowns by a common factor, it is the first row.
+    """
     basis = echelon(free, SMALLEST_PART)
     relative = np.array([kind != "free" for kind in kinds], bool) & (x != 0.0) & np.any(basis != 0.0, axis=0)
     if len(basis) < 2 or not relative.any():
@@ -268,7 +281,7 @@ def _sentences(result: Uncertainty) -> Iterator[str]:
 
 
 def _noise_sentence(chi2: float, freedom: int) -> Iterator[str]:
-    """Iterate over a sentence if the residuals are larger or smaller than the given noise."""
+    """Yield a sentence if the residuals are significantly larger or smaller than the given noise; otherwise nothing."""
     ratio = np.sqrt(chi2 / freedom)
     numbers = f"chi^2 = {chi2:.4g} with {freedom} degrees of freedom"
     if chdtrc(freedom, chi2) < SIGNIFICANCE:
@@ -282,7 +295,7 @@ def _noise_sentence(chi2: float, freedom: int) -> Iterator[str]:
 
 
 def describe(values: UnknownValues, coefficients: Float[np.ndarray, "K"]) -> Direction:
-    """Describe a direction of z, either as a common factor or by changes relative to one percent of the largest change."""
+    """Return a direction of z in words: by a common factor, or by changes that are scaled so that the largest is one percent."""
     nonzero = np.flatnonzero(coefficients).tolist()
     x, change = (np.asarray(a, float)[nonzero] for a in (values.x, values.dx_dz))
     change = change * coefficients[nonzero]

@@ -1,10 +1,10 @@
 """The normal approximation of a posterior density at its mode, in the unconstrained vector.
 
-The curvature is that of Gauss and Newton, J^T J of the weighted residuals, with the exact one of the prior and of the transforms
-where it is positive. Importance weights,
-the ratios of the density to the approximation at draws of the approximation, show whether it may be trusted. They are reliable if
-the exponent k of a generalized Pareto distribution of the largest weights is below 1 - 1 / log10(S) for S draws. The weighted
-means and standard deviations of the draws are then those of the density, and have to be near the approximation's.
+The curvature of the likelihood is that of Gauss and Newton, J^T J of the weighted residuals; the exact curvatures of the prior
+and, where it is positive, of the transforms are added. Importance weights, the ratios of the density to the approximation at
+draws of the approximation, show whether it may be trusted. They are reliable if the exponent k of a generalized Pareto
+distribution of the largest weights is below 1 - 1 / log10(S) for S draws. The weighted means and standard deviations of the draws
+are then those of the density, and have to be near the approximation's.
 A. Vehtari et al., Pareto smoothed importance sampling, Journal of Machine Learning Research 25 (2024) 72; the estimate of k:
 J. Zhang & M. A. Stephens, Technometrics 51 (2009) 316.
 """
@@ -45,7 +45,7 @@ class Laplace:
         shift: largest error of a mean of the vector, in standard deviations, by these weights; trusted up to 0.25.
         ratio: largest ratio of a standard deviation to the approximation's, or its inverse; trusted up to 1.25.
         log_evidence: logarithm of the integral of the density, by importance sampling.
-        log_evidence_error: its standard error.
+        log_evidence_error: standard error of `log_evidence`.
         trials: vectors (S, K) drawn from the approximation.
         log_weights: logarithms (S,) of their importance weights, the ratios of the density to the approximation.
     """
@@ -89,11 +89,14 @@ class Laplace:
         return f"the normal approximation is poor ({errors}): sample the posterior"
 
     def draws(self, count: int, seed: int = 0) -> Float[np.ndarray, "count K"]:
-        """Return unconstrained vectors drawn from the approximation."""
+        """Return `count` unconstrained vectors drawn from the approximation."""
         return self.mode + np.random.default_rng(int(seed)).standard_normal((count, len(self.mode))) @ self.root.T
 
     def starts(self, count: int, seed: int = 0) -> Float[np.ndarray, "count K"]:
-        """Return different vectors that are nearly draws of the density itself, by resampling the trials with their weights."""
+        """Return `count` vectors that are nearly draws of the density itself, by resampling the trials with their weights.
+
+        They are different, unless there are fewer trials of positive density.
+        """
         order = np.argsort(-(self.log_weights + np.random.default_rng(int(seed)).gumbel(size=len(self.log_weights))))
         return np.resize(self.trials[order[: min(count, np.isfinite(self.log_weights).sum())]], (count, len(self.mode)))
 
@@ -103,9 +106,9 @@ class Laplace:
 
 
 def approximate(problem: InferenceProblem, x: Float[np.ndarray, "K"], seed: int = 0, quick: bool = False) -> Laplace:
-    """Find the mode of a density from a vector near it, and approximate the density there.
+    """Return the normal approximation of a density at its mode, which is found from a vector x near it.
 
-    If `quick`, a quarter of the importance weights is enough where the verdict is clear.
+    If `quick`, only a quarter of the importance weights is computed where these leave no doubt about the verdict.
 
     Raises:
         IdentificationError: neither the records nor a prior determine some unknowns, records without given noise fit exactly, or
@@ -132,7 +135,9 @@ def approximate(problem: InferenceProblem, x: Float[np.ndarray, "K"], seed: int 
 def weigh(
     problem: InferenceProblem, x: Float[np.ndarray, "K"], root: Float[np.ndarray, "K K"], seed: int = 0, quick: bool = False
 ) -> Laplace:
-    """Compare a density with a normal one of this center and root of its covariance, by importance weights.
+    """Return the normal approximation of a density with center x and covariance root root^T, judged by importance weights.
+
+    If `quick`, only a quarter of the importance weights is computed where these leave no doubt about the verdict.
 
     Raises:
         IdentificationError: the density is zero at the center, or everywhere around it.
@@ -164,7 +169,10 @@ def weigh(
 def _errors(
     distances: Float[np.ndarray, "S K"], log_weights: Float[np.ndarray, "S"], root: Float[np.ndarray, "K K"]
 ) -> tuple[float, float]:
-    """Return the largest error of a mean, in deviations, and of a deviation, as a factor, by importance weights."""
+    """Return the largest error of a mean (in standard deviations) and of a standard deviation (a factor), by importance weights.
+
+    `distances` are draws of the approximation relative to its center.
+    """
     weights = np.exp(log_weights - np.logaddexp.reduce(log_weights))
     size = np.sqrt(np.sum(root**2, axis=1))
     means = weights @ distances
@@ -173,7 +181,7 @@ def _errors(
 
 
 def _require_noise(problem: InferenceProblem, x: Float[np.ndarray, "K"]) -> None:
-    """Raise an error if noise that is not given is too small to be noise; the density would grow without limit."""
+    """Raise an error if estimated noise is so small that it is rounding: the density would grow without limit as it decreases."""
     fit, sizes = problem.fit_problem, problem.unknowns.values(x)[problem.fit_problem.K :]
     least = [NOISE_FLOOR * fit.channel_scale[channel] for _, channel in problem.scales.values()]
     names = [name.removeprefix("noise of ") for name, size, low in zip(problem.scales, sizes, least, strict=True) if size < low]
@@ -183,7 +191,10 @@ def _require_noise(problem: InferenceProblem, x: Float[np.ndarray, "K"]) -> None
 
 
 def expand(problem: InferenceProblem, x: Float[np.ndarray, "K"]) -> tuple[float, np.ndarray, np.ndarray]:
-    """Return the log density up to a constant, its gradient, and the negative of its second derivatives by Gauss and Newton."""
+    """Return the log density at x up to a constant, its gradient, and the negative of its second derivatives by Gauss and Newton.
+
+    The log density is -inf if a run fails.
+    """
     least_squares = problem.fit_problem
     K, rows = least_squares.K, len(least_squares.index)
     prior, gradient, second = (np.array(part, float) for part in problem.prior_curvature(x))
@@ -214,7 +225,7 @@ def expand(problem: InferenceProblem, x: Float[np.ndarray, "K"]) -> tuple[float,
 
 
 def _newton_step(gradient: np.ndarray, curvature: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return the step to the mode in the directions in which the density falls, and its size in standard deviations."""
+    """Return the step to the mode in the directions in which the density is concave, and its size in standard deviations."""
     scale, s, v = _spectrum(curvature)
     shown = s > INVISIBLE_RATIO * s.max()
     along = (v.T @ (gradient / scale))[shown] / s[shown]
@@ -229,7 +240,11 @@ def _spectrum(curvature: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray
 
 
 def _root(problem: InferenceProblem, curvature: np.ndarray) -> np.ndarray:
-    """Return the root of the covariance."""
+    """Return a root (K, K) of the covariance, the inverse of the curvature.
+
+    Raises:
+        IdentificationError: the curvature vanishes in some directions.
+    """
     scale, s, v = _spectrum(curvature)
     blind = np.abs(np.diag(curvature)) <= INVISIBLE_RATIO**2 * np.abs(np.diag(curvature)).max()
     flat = v[:, s <= INVISIBLE_RATIO * s.max()]
@@ -242,7 +257,10 @@ def _root(problem: InferenceProblem, curvature: np.ndarray) -> np.ndarray:
 
 
 def pareto_exponent(weights: Float[np.ndarray, "S"]) -> float:
-    """Return the exponent k of the generalized Pareto distribution of the largest weights, given their logarithms."""
+    """Return the exponent k of the generalized Pareto distribution of the largest weights, given the logarithms of all weights.
+
+    It is -inf if all weights are equal.
+    """
     count = len(weights)
     tail = int(min(0.2 * count, 3.0 * np.sqrt(count)))
     ordered = np.exp(np.sort(weights) - np.max(weights))

@@ -50,7 +50,7 @@ class InferenceProblem:
     Attributes:
         names: names of the unknowns: parameters, changes of initial states, and standard deviations of noise that is not given
             ("noise of body.crank.angle"), which is one more number for each channel.
-        units: their units.
+        units: units of the unknowns.
         start: the vector (K,) of the scene's own numbers.
         max_steps: largest number of steps of a run; beyond, the density is zero.
     """
@@ -79,7 +79,13 @@ class InferenceProblem:
         self.programs: dict[str, Any] = {}  # compiled functions, which copies for other measured values share
 
     def _scale_noise(self, z: np.ndarray) -> int:
-        """Set the standard deviations of noise that is not given to those of the residuals at z; return the steps of a run."""
+        """Set the standard deviations of noise that is not given to those of the residuals at z.
+
+        Return the largest number of steps of a run at z.
+
+        Raises:
+            IdentificationError: a run fails.
+        """
         problem = self.fit_problem
         used = np.concatenate([np.ones(len(problem.index), bool), np.zeros(problem.extra_rows, bool)])
         code = problem.code(z, self.tol)
@@ -125,9 +131,9 @@ class InferenceProblem:
         return density(jnp.asarray(x, float))
 
     def with_measured(self, measured: Float[Array, "R"] | Numbers) -> "InferenceProblem":
-        """Return the density for other measured values, in the order of record, time and channel, as of a repeated experiment.
+        """Return the problem with other measured values, in the order of record, time and channel, as of a repeated experiment.
 
-        It starts from the same numbers, and shares compiled functions. The values may be traced by JAX.
+        Its start is the same, and it shares compiled functions with this problem. The values may be traced by JAX.
         """
         other = copy(self)
         other.fit_problem = copy(self.fit_problem)
@@ -146,12 +152,12 @@ class InferenceProblem:
         return self.prior(self.unknowns.values(x, jnp)) + jnp.sum(self.unknowns.log_dx_dz(x, jnp))
 
     def parameters(self, x: Float[Array, "K"] | Numbers) -> dict[str, Any]:
-        """Return the numbers of a vector (K,) by name, in `units`; or arrays of those of several vectors (..., K)."""
+        """Return the numbers of the unknowns at x by name, in `units`; for several vectors (..., K), arrays (...)."""
         values = self.unknowns.values(jnp.asarray(x, float), jnp)
         return {name: values[..., k] for k, name in enumerate(self.names)}
 
     def log_likelihoods(self, x: Float[Array, "K"] | Numbers) -> Float[Array, "R"]:
-        """Return the logarithm of the density of each measured value, in the order of record, time and channel."""
+        """Return the logarithm of the likelihood of each measured value, in the order of record, time and channel."""
         return self._likelihoods(jnp.asarray(x, float))[0]
 
     def predicted(self, x: Float[Array, "K"] | Numbers) -> Float[Array, "R"]:
@@ -181,7 +187,7 @@ class InferenceProblem:
         return value, jnp.dot(jnp.where(jnp.isfinite(value), slopes, 0.0), tangents[0])
 
     def prior_curvature(self, x: Float[Array, "K"] | Numbers) -> tuple[Array, Array, Array]:
-        """Return `log_prior`, its gradient and its second derivatives, by a compiled function."""
+        """Return `log_prior` at x, its gradient (K,) and its second derivatives (K, K), by a compiled function."""
 
         def curvature(problem: "InferenceProblem", x: Array) -> tuple[Array, Array, Array]:
             gradient = jax.grad(problem.log_prior)
@@ -190,7 +196,7 @@ class InferenceProblem:
         return self.compiled("prior", curvature)(x)
 
     def log_densities(self, x: Float[Array, "B K"] | Numbers) -> Float[Array, "B"]:
-        """Return `log_density` of several vectors (B, K), by a compiled function, many of them on all threads."""
+        """Return `log_density` of B vectors, by a compiled function; if there are many vectors, by all threads."""
 
         def densities(problem: "InferenceProblem", x: Array) -> Array:
             each = jax.vmap(problem.log_density)
@@ -208,7 +214,10 @@ class InferenceProblem:
         return jnp.asarray(np.concatenate(list(each))[: len(points)])
 
     def compiled(self, name: str, function: Callable[..., Any]) -> Callable[..., Any]:
-        """Return a function of a problem and other arguments, compiled for this problem and others with its `programs`."""
+        """Return a compiled function of some arguments, `function(problem, *arguments)` for this problem.
+
+        It is compiled once for each `name`, and shared by the problems that `with_measured` returns.
+        """
         if name not in self.programs:
             self.programs[name] = jax.jit(lambda measured, *args: function(self.with_measured(measured), *args))
         return partial(self.programs[name], self.fit_problem.measured)

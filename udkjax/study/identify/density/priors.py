@@ -44,7 +44,10 @@ class PriorDensity:
     """
 
     def __init__(self, unknowns: Unknowns, functions: Mapping[int, LogDensityOfNumber], scales: Sequence[int]):
-        """Take priors (mean, deviation) from the unknowns, and others from `functions`, by index; `scales` are those of noise."""
+        """Take normal priors (mean, deviation) from the unknowns, and other priors from `functions`, by the index of the unknown.
+
+        `scales` are the indices of the unknowns that are standard deviations of noise.
+        """
         self.unknowns, self.functions = unknowns, dict(functions)
         of_function = np.isin(np.arange(len(unknowns.names)), list(functions))
         self.normal = np.flatnonzero(np.isfinite(unknowns.sigma) & ~of_function)
@@ -56,7 +59,7 @@ class PriorDensity:
         self.constant = -float(np.log(widths).sum()) - sum(_log_normalization(unknowns, k) for k in self.normal.tolist())
 
     def __call__(self, x: Float[Array, "K"]) -> Float[Array, ""]:
-        """Return the logarithm of the density."""
+        """Return the logarithm of the density at the values x."""
         u, normal = self.unknowns, self.normal
         total = self.constant - 0.5 * jnp.sum(weighted(x[normal], u.mean[normal], u.sigma[normal]) ** 2)
         total -= jnp.sum(jnp.log(x[self.scales]))
@@ -66,7 +69,7 @@ class PriorDensity:
 
 
 def _log_normalization(u: Unknowns, k: int) -> float:
-    """Return the logarithm of the integral of exp(-(x - mean)^2 / (2 sigma^2)) over the values that a number can take."""
+    """Return the logarithm of the integral of exp(-(x - mean)^2 / (2 sigma^2)) over the values that the k-th number can take."""
     size = np.log(u.sigma[k] * np.sqrt(2.0 * np.pi))
     if u.kinds[k] == "free":
         return float(size)
@@ -79,10 +82,12 @@ def _log_normalization(u: Unknowns, k: int) -> float:
 
 
 def with_normal_priors(unknowns: Unknowns, priors: Mapping[str, Any]) -> tuple[Unknowns, dict[str, LogDensityOfNumber]]:
-    """Return the unknowns with the priors (mean, deviation) in `priors`, and the others as functions, by name.
+    """Return the parameters with their normal priors, and all other priors as functions that return the log density, by name.
+
+    The other priors are those given as functions or distributions, and normal ones of unknowns that are not parameters.
 
     Raises:
-        IdentificationError: lists every prior of another kind.
+        IdentificationError: lists every prior that is neither (mean, deviation) nor a function or distribution.
     """
     mean, sigma, functions, problems = unknowns.mean.copy(), unknowns.sigma.copy(), dict[str, LogDensityOfNumber](), list[str]()
     for name, prior in priors.items():
@@ -107,12 +112,12 @@ def with_normal_priors(unknowns: Unknowns, priors: Mapping[str, Any]) -> tuple[U
 
 
 def _normal(mean: float, sigma: float) -> LogDensityOfNumber:
-    """Return the normal density of an unknown that is not among the parameters: of an initial state, or of noise."""
+    """Return the logarithm of a normal density as a function, for unknowns other than parameters: initial states and noise."""
     return lambda x: -0.5 * weighted(x, np.asarray(mean), sigma) ** 2 - np.log(sigma * np.sqrt(2.0 * np.pi))
 
 
 def require_priors_of(unknowns: Unknowns, functions: Mapping[str, LogDensityOfNumber]) -> None:
-    """Require that each function belongs to an unknown, and is a function of JAX that has a derivative there.
+    """Require that each function belongs to an unknown, and can be differentiated by JAX.
 
     Raises:
         IdentificationError: lists every mistake.

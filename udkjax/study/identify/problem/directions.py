@@ -31,7 +31,7 @@ Directions: TypeAlias = Annotated[
 
 
 def usual_directions(problem: FitProblem, seed: int) -> tuple[tuple[str, ...], Float[np.ndarray, "D K"]]:
-    """Return each unknown by itself, and some random combinations of all."""
+    """Return the names of the default directions and unit vectors: each unknown by itself, and random combinations of all."""
     names = problem.all_names[: problem.K - problem.constrained]
     random = np.random.default_rng(int(seed)).standard_normal((RANDOM_DIRECTIONS if problem.K > 1 else 0, problem.K))
     directions = np.concatenate([np.eye(problem.K)[: len(names)], random / np.linalg.norm(random, axis=1, keepdims=True)])
@@ -41,7 +41,13 @@ def usual_directions(problem: FitProblem, seed: int) -> tuple[tuple[str, ...], F
 def given_directions(
     problem: FitProblem, z: Float[np.ndarray, "K"], given: Directions
 ) -> tuple[tuple[str, ...], Float[np.ndarray, "D K"]]:
-    """Return directions of unit length from changes of unknowns in their units, by names."""
+    """Return the names of given directions, and unit vectors in the space of z.
+
+    `given` has the changes of unknowns, in their units, for each direction; z is the point at which these are converted.
+
+    Raises:
+        IdentificationError: lists every mistake, such as a direction that names no unknown.
+    """
     P, problems = len(problem.unknowns.names), []
     per_unit = np.ones(problem.K)  # dz over the change of an unknown
     per_unit[:P] = 1 / problem.unknowns.dx_dz(z[:P])

@@ -48,7 +48,7 @@ Strategy = Literal["auto", "pieces"]
 
 
 class RunEnds(NamedTuple):
-    """States at the first and last time of runs, (B, runs, 2 times, 2, n), and their derivatives (B, runs, 2, 2, n, P + S)."""
+    """States (q, v) at the first and last time of runs, (B, runs, 2 times, 2, n), and derivatives (B, runs, 2, 2, n, P + S)."""
 
     states: np.ndarray
     slopes: np.ndarray
@@ -119,7 +119,7 @@ class FitProblem:
         return np.concatenate([group, np.full(self.extra_rows, -1)])
 
     def by_record(self, rows: Float[np.ndarray, "R"]) -> tuple[dict[str, np.ndarray], ...]:
-        """Arrange a number per residual in a table for each record: channels at its times, NaN where nothing was measured."""
+        """Return a table of numbers (R,) for each record: by channel, at the record's times, NaN where nothing was measured."""
         table = np.full(self.y.shape, np.nan)
         table[self.present] = rows
         tables = []
@@ -134,7 +134,11 @@ class FitProblem:
     def members(
         self, z: Float[NumericArray, "B K"], runs: Int[np.ndarray, "N"], horizon: float | None = None, xp: Any = np
     ) -> Members:
-        """Return the members of B sets of unknowns: N runs of the first set, then the same of the next; by NumPy or JAX."""
+        """Return the inputs of predictions of N runs with each of B sets of unknowns z, by NumPy or JAX (`xp` `jax.numpy`).
+
+        The N runs with the first set come first, then those with the next set. Runs end `horizon` seconds after the beginning of
+        their record; if it is None, at their last times.
+        """
         columns, sets = self.columns[runs], len(z)
         x = xp.repeat(self.unknowns.values(z[:, : len(self.unknowns.names)], xp), len(runs), axis=0)
         shift = xp.where(columns < 0, 0.0, z[:, columns]).reshape(len(x), columns.shape[1])
@@ -145,11 +149,11 @@ class FitProblem:
         return members._replace(runs=members.runs._replace(ts=ts))
 
     def members_of(self, runs: Int[np.ndarray, "M"], x: Float[NumericArray, "M P"], shift: Float[NumericArray, "M S"]) -> Members:
-        """Return the members of some runs with given parameters and unknowns of their initial states."""
+        """Return the inputs of predictions of M runs with parameters x and unknowns `shift` of the initial states."""
         return Members(x, shift, jax.tree.map(lambda leaf: leaf[runs], self.runs))
 
     def evaluate(self, z: Float[np.ndarray, "B K"], tol: TolerancePair, horizon: float | None = None) -> Residuals:
-        """Compute residuals and their Jacobian as a whole: see `row_blocks`. Later residuals than the horizon are zero."""
+        """Return all residuals and their Jacobian: see `row_blocks`. Residuals later than the horizon are zero."""
         return join_rows(self.row_blocks(z, tol, horizon), len(self.index) + self.extra_rows)
 
     def row_blocks(self, z: Float[np.ndarray, "B K"], tol: TolerancePair, horizon: float | None = None) -> Iterator[Residuals]:
@@ -197,13 +201,13 @@ class FitProblem:
         return self._residuals_of(prediction, rows, runs, z)
 
     def code(self, z: Float[np.ndarray, "K"], tol: TolerancePair) -> int:
-        """Return the worst result of the runs of all records."""
+        """Return the worst result of the runs of all records at the unknowns z, a number of `Result`."""
         return max(int(block.code[0]) for block in self.row_blocks(z[None], tol))
 
     def second_derivatives(
         self, z: Float[np.ndarray, "K"], d: Float[np.ndarray, "K"], tol: TolerancePair
     ) -> Float[np.ndarray, "R"]:
-        """Return the second derivatives of the predicted values along a direction, in the units of channels."""
+        """Return the second derivatives of the R predicted values at z along a direction d, in the units of channels."""
         P, found = len(self.unknowns.names), np.zeros(len(self.index))
         first, second = self.unknowns.dx_dz(z[:P]) * d[:P], self.unknowns.d2x_dz2(z[:P]) * d[:P] ** 2
         for run, columns in enumerate(self.columns):
@@ -242,7 +246,11 @@ class FitProblem:
         return tuple(states)
 
     def further_rows(self, ends: RunEnds | None, z: Float[np.ndarray, "B K"]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """Iterate over further residuals with their Jacobians: those of priors, (x - mean) / sigma."""
+        """Iterate over blocks of residuals after the measured ones, (B, rows), and their Jacobians, (B, rows, K).
+
+        `row_blocks` calls this after all runs, with the ends of the runs if the predictor computes these. Here, the residuals are
+        those of priors, (x - mean) / sigma; overrides may yield more, which `extra_rows` has to count.
+        """
         which, u = self.priors, self.unknowns
         if not len(which):
             return
@@ -252,9 +260,13 @@ class FitProblem:
         yield weighted(u.values(z)[:, which], u.mean[which], u.sigma[which]), J
 
     def by_unknowns(self, by: np.ndarray, run: np.ndarray, z: np.ndarray) -> np.ndarray:
-        """Convert derivatives with respect to x and the state of each row's run, (B, R, P + S), to those for z, (B, R, K).
+        """Return the derivatives of residuals with respect to the unknowns z, (B, R, K).
 
-        The given ones may be overwritten.
+        Args:
+            by: derivatives with respect to the parameters x and the initial-state unknowns of each row's run, (B, R, P + S); they
+                may be overwritten.
+            run: the run of each row (R,).
+            z: the unknowns (B, K).
         """
         P = len(self.unknowns.names)
         if self.K == P:

@@ -27,7 +27,7 @@ SMALLEST_READABLE_PART = 1e-3  # least pivot, relative to the largest, of coordi
 
 
 class InitialStateUnknowns(NamedTuple):
-    """The S dimensionless unknowns of one initial state, which tied records share.
+    """The S dimensionless unknowns of one initial state, which records with the same named start share.
 
     `sizes` (S,) are the changes of the named coordinates and rates per unit of each unknown, in `units`; `basis` has the
     changes of all q and v (n,).
@@ -82,9 +82,14 @@ def _same(first: Start, second: Start) -> bool:
 
 
 def state_unknowns(mech: StudyModel, t0: float, guess: State | None, estimate: Estimated, label: str) -> InitialStateUnknowns:
-    """Choose coordinates that parametrize the closed states near a guess (None: the scene's guess), only angles if possible.
+    """Return the unknowns of the closed states near a guess: changes of chosen coordinates, only of angles if possible.
 
-    The names of the unknowns begin with `label`.
+    Args:
+        mech: the mechanism or system.
+        t0: time of the state (s).
+        guess: the guess of the state; None for the scene's own.
+        estimate: the parts of the state that are unknown.
+        label: beginning of the names of the unknowns.
     """
     if not isinstance(mech, Mechanism):
         return _entries_as_unknowns(mech, t0, guess, estimate, label)
@@ -115,7 +120,7 @@ def state_unknowns(mech: StudyModel, t0: float, guess: State | None, estimate: E
 def _entries_as_unknowns(
     system: ConstrainedSystem, t0: float, guess: State | None, estimate: Estimated, label: str
 ) -> InitialStateUnknowns:
-    """Choose coordinates that parametrize the positions, and velocities that parametrize the velocities, of closed states."""
+    """Return the unknowns of closed states of a system: coordinates that determine q, and velocities that determine v."""
     state = assemble(system, t0, guess)
     q, v = (np.asarray(x, float) for x in (state.q, state.v))
     n, parts, names, sizes = len(q), [], [], []
@@ -135,7 +140,7 @@ def _entries_as_unknowns(
 
 
 def _independent_rows(free: np.ndarray, has_angles: bool = True) -> list[int]:
-    """Choose as many well-conditioned rows as there are columns, only rows of angles, every third, if possible."""
+    """Return the indices of as many well-conditioned rows as there are columns; only of angles, every third row, if possible."""
     count, all_rows = free.shape[1], np.arange(len(free))
     chosen = all_rows[:0]
     for rows in (all_rows[2::3], all_rows) if has_angles else (all_rows,):

@@ -8,7 +8,7 @@ order if and only if
 
 This must hold at all positions, and it is not sufficient: cranks of l + d, l and l - d satisfy it, and violate the constraints to
 second order. A change that is consistent to first order is therefore verified by a finite step: the mechanism must close with the
-same rank. All of this is NumPy on the programs of the rows; without redundant rows nothing is checked.
+same rank. NumPy computes all of this from the programs of the rows. Without redundant rows nothing is checked.
 """
 
 import dataclasses
@@ -80,7 +80,13 @@ def loop_problems(
 
 
 def nearest_closable(mechanism: Mechanism, unknowns: Unknowns, seed: int) -> tuple[Analysis, Unknowns]:
-    """Return the mechanism's analysis and the unknowns, at the first guess or the nearest guess that can be closed."""
+    """Return the mechanism's analysis and the unknowns, at the first guess or the nearest guess that can be closed.
+
+    The guesses are samples around the first one.
+
+    Raises:
+        AssemblyError: the mechanism cannot be closed with any of the guesses.
+    """
     z = sample_guesses(unknowns, np.zeros(len(unknowns.names)), NEARBY_GUESSES, seed)
     nearby = unknowns.values(z[np.argsort(np.linalg.norm(z, axis=1))])
     for k, x in enumerate([unknowns.guess, *nearby]):
@@ -145,7 +151,11 @@ class RedundantLoops:
         self._measure(rows, steps, _length(original))
 
     def _measure(self, rows: PositionRows, steps: np.ndarray, length_scale: float):
-        """Differentiate Psi by each parameter, and project on the left null space, which no motion can compensate."""
+        """Set the effects of parameters on Psi at all positions, and their parts in the left null space of Psi_q.
+
+        No motion compensates the latter parts. `steps` (P,) are the steps of differences; `length_scale` is the size of rows
+        without lever arms.
+        """
         evaluated = [rows.at(p.t, p.q) for p in self._positions]
         columns = []
         for step in np.diag(steps):
@@ -201,7 +211,11 @@ class RedundantLoops:
         return True
 
     def _ties(self, members: Sequence[int], closed: np.ndarray) -> np.ndarray:
-        """Return directions (ties, members) in which parameters may vary, simplest first, of those `closed` to first order."""
+        """Return directions (ties, members) in which the parameters `members` may vary together, the simplest first.
+
+        They are combinations of the orthonormal rows `closed`, which keep the loops closed to first order, and are verified by a
+        step.
+        """
         chosen = np.zeros((0, len(members)))
         for candidate in self._candidates(members, closed):
             size = np.linalg.norm(candidate)
@@ -251,7 +265,7 @@ class RedundantLoops:
         return f"{who} cannot vary independently: {self._loop_text(members)} that only closes for {condition}; {cure}"
 
     def _loop_text(self, members: Sequence[int]) -> str:
-        """Name the constraints of the loop that these parameters would open."""
+        """Return a clause that names the constraints of the loop that these parameters would open."""
         opened = np.einsum("srk,srm->skm", self._circuits, self._effect[:, :, members])
         part_of = np.abs(opened).max((0, 2)) > DEPENDENT_PART
         circuits = self._circuits[:, :, part_of if part_of.any() else slice(None)]
@@ -262,7 +276,7 @@ class RedundantLoops:
 
 
 def tie_text(names: Sequence[str], x: np.ndarray, u: np.ndarray) -> str:
-    """Return the relation in words between parameters with values x and changes u."""
+    """Return in words how some parameters must vary together; x are their values, and u their changes."""
     nonzero = np.flatnonzero(u).tolist()
     names, x, u = [names[i] for i in nonzero], x[nonzero], u[nonzero]
     same = np.allclose(u, u[0], rtol=SAME_CHANGE)

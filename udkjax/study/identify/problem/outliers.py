@@ -27,7 +27,7 @@ class Outlier(NamedTuple):
 
 
 def find_outlier_rows(problem: FitProblem, r: Float[np.ndarray, "R"]) -> Bool[np.ndarray, "R"]:
-    """Return a mask of the outliers from weighted residuals, channel by channel over all records."""
+    """Return a mask of the outliers among weighted residuals r; each channel of all records is examined by itself."""
     mask, channel = np.zeros(len(problem.index), bool), problem.index[:, 2]
     shows = np.abs(r * problem.sigma) > NOISE_FLOOR * problem.channel_scale[channel]
     for c in range(len(problem.channels)):
@@ -39,7 +39,10 @@ def find_outlier_rows(problem: FitProblem, r: Float[np.ndarray, "R"]) -> Bool[np
 def list_outliers(
     problem: FitProblem, rows: Bool[np.ndarray, "R"], residuals: Float[np.ndarray, "R"], sigma: Float[np.ndarray, "R"]
 ) -> tuple[Outlier, ...]:
-    """Return the outliers, with residuals in the units of their channels and the noise of the other values."""
+    """Return the outliers at the marked rows.
+
+    `residuals` are in the units of their channels, and `sigma` is the noise of the other values.
+    """
     outliers = []
     for k in np.flatnonzero(rows).tolist():
         record, time, c = problem.index[k].tolist()
@@ -50,7 +53,10 @@ def list_outliers(
 
 
 def outlier_sentences(problem: FitProblem, outliers: Sequence[Outlier], robust: bool) -> Iterator[str]:
-    """Iterate over sentences that list the outliers of each channel of each record, with advice."""
+    """Iterate over sentences that list the outliers of each channel of each record, with advice.
+
+    `robust` is True if the loss reduces the influence of outliers.
+    """
     prefixes = label_prefixes(problem.records)
     for k, name in dict.fromkeys((outlier.record, outlier.channel) for outlier in outliers):
         of_channel = sorted(

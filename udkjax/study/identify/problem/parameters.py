@@ -98,12 +98,12 @@ class _Part(NamedTuple):
     """The target of one unknown, and its value in the scene."""
 
     target: Target
-    value: float | None
+    value: float | None  # None for a function
     same: bool  # True if all tied numbers have this value
 
 
 def unknowns_of(mechanism: StudyModel, given: ParametersLike) -> Unknowns:
-    """Read parameters: strings, lengths, functions and `Parameter`s.
+    """Return the unknowns for parameters that are given as strings, lengths, functions or `Parameter`s.
 
     Raises:
         IdentificationError: lists every mistake.
@@ -127,7 +127,7 @@ def unknowns_of(mechanism: StudyModel, given: ParametersLike) -> Unknowns:
 
 
 def _entries(mechanism: StudyModel, item: ParameterLike, problems: list[str]) -> list[Unknown]:
-    """Return the unknowns of a parameter, one for each entry of an array."""
+    """Return the unknowns of a parameter, one for each entry of an array; mistakes are added to `problems`."""
     p = item if isinstance(item, Parameter) else Parameter(item)
     try:
         parts = _parts(mechanism, p)
@@ -153,7 +153,7 @@ def _name(target: Target) -> str:
 
 
 def _unknown(mechanism: StudyModel, p: Parameter, name: str, part: _Part) -> Unknown:
-    """Return the unknown of a number.
+    """Return the unknown for one number that a parameter refers to.
 
     Raises:
         ValueError: its first guess, bounds, prior, transform or scale is invalid.
@@ -192,7 +192,7 @@ def _units(mechanism: StudyModel, target: Target) -> str:
 
 
 def _is_positive(mechanism: StudyModel, target: Target, guess: float) -> bool:
-    """Return True if a value must stay positive."""
+    """Return True if the value assigned to a target must stay positive."""
     if target.function is not None:
         return isinstance(target.function, Length)
     return guess > 0 and (target.scaled or all(mechanism.must_be_positive(name) for name in target.names))

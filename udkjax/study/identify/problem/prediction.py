@@ -66,7 +66,18 @@ class Prediction(NamedTuple):
 
 
 class Predictor:
-    """Predicts the values of `channels` for members: the mechanism with parameters assigned to `targets`."""
+    """A function of members that predicts the values of channels, with stored results.
+
+    Args:
+        mechanism: the mechanism.
+        targets: the numbers of the mechanism that the parameters of a member are assigned to.
+        channels: the channels to predict.
+        settings: further arguments of `simulate`.
+        ends: True to return also the states at the first and last time of each run.
+
+    Attributes:
+        evaluations: number of members computed so far.
+    """
 
     def __init__(
         self,
@@ -83,7 +94,7 @@ class Predictor:
         self._run = _MemberRun(static, targets, channels, ends)
 
     def __call__(self, members: Members, tol: TolerancePair) -> Prediction:
-        """Predict members, integrated with the given tolerances."""
+        """Return the prediction of members, integrated with the given tolerances; it may be a stored one."""
         size = len(members.x)
         key = b"".join(np.asarray(leaf).tobytes() for leaf in jax.tree.leaves((members, tol)))
         if key in self._cache:
@@ -102,7 +113,7 @@ class Predictor:
         return predicted
 
     def traced(self, members: Members, tol: TolerancePair) -> dict[str, Array]:
-        """Predict members within a program of JAX: values y (M, T, C), and the result `code` (M,) of each run."""
+        """Return predictions for members within a program of JAX, by name: values "y" (M, T, C), results "code" (M,)."""
 
         def predict(member: Members) -> dict[str, Array]:
             no_shift = jnp.zeros(member.x.shape[0] + member.shift.shape[0])
@@ -120,13 +131,13 @@ class Predictor:
         return np.stack([np.asarray(_second_derivative(self._run, (self._arrays, np.array(tol)), *x)) for x in inputs])
 
     def guess(self, members: Members, which: int) -> State:
-        """Return the guess from which the initial state of a member is closed."""
+        """Return the guess from which the initial state of the member with index `which` is closed."""
         member = jax.tree.map(lambda leaf: leaf[which], members)
         return jax.tree.map(np.asarray, _guess(self._run, self._arrays, member))
 
 
 class _MemberRun:
-    """The computation of a member, hashable by its static part; equal computations share programs."""
+    """The computation of one member's prediction, hashable by its static part; equal computations share compiled programs."""
 
     def __init__(self, static: PyTree, *choices: Hashable):
         leaves, structure = jax.tree.flatten(static)

@@ -17,9 +17,10 @@ BLOCK_NUMBERS = 4096  # size of a block of rows, of which BLAS computes products
 
 
 class Residuals(NamedTuple):
-    """Residuals r and Jacobians J = dr/dz at B sets of unknowns, of the given `rows` of a problem in increasing order.
+    """Residuals r and Jacobians J = dr/dz at B sets of unknowns, for some rows of a problem.
 
-    `code` is the worst result of the runs that they are computed from. Without `rows`, they are all of a problem.
+    `rows` are the indices of these rows, in increasing order; None for all rows of a problem. `code` is the worst result of the
+    runs from which the residuals are computed.
     """
 
     r: Float[np.ndarray, "B R"]
@@ -43,7 +44,7 @@ class Residuals(NamedTuple):
 
 
 def join_rows(blocks: Iterable[Residuals], count: int) -> Residuals:
-    """Return blocks as one, with `count` rows; rows of no block are zero."""
+    """Return all blocks joined to one with `count` rows; rows that are in no block are zero."""
     blocks = list(blocks)
     sets, _, K = blocks[0].J.shape
     r, J = np.zeros((sets, count)), np.zeros((sets, count, K))
@@ -62,14 +63,14 @@ def residual_vector(blocks: Iterable[Residuals]) -> tuple[Float[np.ndarray, "R"]
 
 
 class Reduction:
-    """Rows of [J r] that are reduced as they come: see `reduce_rows`. `count` is the number of rows that have come."""
+    """Rows of [J r], reduced to few as they are added: see `reduce_rows`. `count` is the number of rows that were added."""
 
     def __init__(self, unknowns: int):
         self.count = 0
         self._table = np.zeros((0, unknowns + 1))
 
     def add(self, r: Float[np.ndarray, "R"], J: Float[np.ndarray, "R K"]) -> None:
-        """Add rows."""
+        """Add R residuals and their Jacobian."""
         if not len(r):
             return
         self.count += len(r)
@@ -78,24 +79,24 @@ class Reduction:
         self._table = np.linalg.qr(table, mode="r") if len(self._table) else table
 
     def scaled(self, factor: Float[np.ndarray, "K"]) -> "Reduction":
-        """Return the same with unknowns in other units, dz = factor dz'."""
+        """Return these rows for unknowns z' in other units, dz = factor dz'."""
         other = Reduction(len(factor))
         other.count, other._table = self.count, self._table * np.append(factor, 1.0)
         return other
 
     @property
     def r(self) -> Float[np.ndarray, "n"]:
-        """The reduced residuals, at most K + 1."""
+        """The reduced residuals, at most K + 1 in number."""
         return self._table[:, -1]
 
     @property
     def J(self) -> Float[np.ndarray, "n K"]:
-        """Their Jacobian."""
+        """The Jacobian of the reduced residuals."""
         return self._table[:, :-1]
 
 
 def reduce_blocks(blocks: Iterable[Residuals]) -> Reduction | None:
-    """Return the reduced rows of the first set of unknowns; None at the first block that cannot be computed."""
+    """Return the reduced rows of all blocks for the first set of unknowns; None if a block cannot be computed."""
     reduction = None
     for block in blocks:
         if not block.ok[0]:
@@ -106,13 +107,18 @@ def reduce_blocks(blocks: Iterable[Residuals]) -> Reduction | None:
 
 
 class ReducedGroups(NamedTuple):
-    """The rows of [J r] of a fit, reduced for each group of residuals with a common unknown noise, and then for the others."""
+    """The rows of [J r] of a fit, reduced by groups of residuals with a common unknown noise.
+
+    Attributes:
+        groups: the rows of each group, followed by all rows whose noise is known.
+        prior_rows: the Jacobian of the residuals of priors, which the last item of `groups` contains, too.
+    """
 
     groups: Sequence[Reduction]
     prior_rows: Float[np.ndarray, "priors K"]
 
     def scaled(self, factor: Float[np.ndarray, "K"]) -> "ReducedGroups":
-        """Return the same with unknowns in other units, dz = factor dz'."""
+        """Return these rows for unknowns z' in other units, dz = factor dz'."""
         return ReducedGroups([group.scaled(factor) for group in self.groups], self.prior_rows * factor)
 
     @property
@@ -122,7 +128,7 @@ class ReducedGroups(NamedTuple):
 
     @property
     def J(self) -> Float[np.ndarray, "n K"]:
-        """The reduced rows of all groups."""
+        """The reduced rows of J of all groups."""
         return np.concatenate([group.J for group in self.groups])
 
     @property
@@ -138,10 +144,14 @@ def reduce_groups(
     priors: int = 0,
     used: Bool[np.ndarray, "R"] | None = None,
 ) -> ReducedGroups:
-    """Reduce the rows of a fit by groups of common noise.
+    """Return the rows of a fit, reduced by groups of common noise.
 
-    `group` is the group (0, 1, ...) of residuals with a common unknown noise, or -1 if the noise is known. The last rows are
-    those of `priors`. Only rows that are `used`, by default all, are taken.
+    Args:
+        blocks: the residuals of the fit; the first set of unknowns is used.
+        unknowns: number K of unknowns.
+        group: the group (0, 1, ...) of residuals with a common unknown noise; -1 if the noise is known.
+        priors: number of residuals of priors, which are the last rows.
+        used: mask of the rows that are used; by default all are.
     """
     groups, prior_rows = [Reduction(unknowns) for _ in range(group.max(initial=-1) + 2)], np.zeros((priors, unknowns))
     for block in blocks:

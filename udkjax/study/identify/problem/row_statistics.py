@@ -32,9 +32,9 @@ def hat_bands(
     scale: Float[np.ndarray, "R"],
     used: Bool[np.ndarray, "R"],
 ) -> dict[tuple[int, int], Float[np.ndarray, "L n"]]:
-    """Return the `HatBands` of U = J W among the rows that are used, for each record and channel.
+    """Return `HatBands.values` of U = J W for each record and channel, by the indices of these.
 
-    W is the `projector`, and rows of J are divided by `scale`.
+    W is the `projector`, and rows of J are divided by `scale`. Only the rows that are `used` count.
     """
     record, _, channel = problem.index.T
     series = record * len(problem.channels) + channel

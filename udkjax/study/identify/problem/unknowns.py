@@ -40,7 +40,13 @@ STATE_RADIUS = 0.05  # distance of guesses of initial states from the first, rel
 
 
 class Target(NamedTuple):
-    """The numbers of a scene that a value is assigned to. Targets are hashable, to share compiled programs among values."""
+    """The numbers of a scene that a value is assigned to. Targets are hashable, to share compiled programs among values.
+
+    Attributes:
+        names: names of the numbers.
+        scaled: True if the value is a factor of the scene's own numbers, and not their new value.
+        function: (mechanism, value) -> mechanism, which assigns the value; if it is given, names are not used.
+    """
 
     names: tuple[str, ...] = ()
     scaled: bool = False
@@ -57,15 +63,15 @@ class Unknown(NamedTuple):
     at_scene_value: bool  # True if the first guess is the scene's value
     guess: float
     low: float  # NaN if there are no bounds
-    high: float
-    scale: float
+    high: float  # NaN if there are no bounds
+    scale: float  # typical size of a change of a free parameter
     mean: float  # NaN if there is no prior
-    sigma: float
+    sigma: float  # standard deviation of the prior; NaN if there is none
 
 
 @dataclass(frozen=True, eq=False)
 class Unknowns:
-    """All P parameters: see `Unknown`; arrays are (P,)."""
+    """All P parameters: the fields are those of `Unknown`, for each parameter; arrays are (P,)."""
 
     names: tuple[str, ...]
     units: tuple[str, ...]
@@ -81,7 +87,7 @@ class Unknowns:
 
     @classmethod
     def of(cls, each: Sequence[Unknown]) -> "Unknowns":
-        """Combine parameters."""
+        """Return the `Unknowns` of some parameters, in their order."""
         names, units, targets, kinds, at_scene_value, *numbers = zip(*each, strict=True)
         return cls(names, units, targets, kinds, all(at_scene_value), *np.array(numbers, float))
 
@@ -109,7 +115,7 @@ class Unknowns:
         return xp.where(positive, own + z, xp.where(bounded, at_bound, np.log(self.scale)))
 
     def _values(self, z: Any, xp: Any) -> tuple[Any, Any]:
-        """Return the values x at z, and the part of the way from the lower to the upper bound."""
+        """Return the values x at z, and the fraction of the way from the lower to the upper bound."""
         positive, bounded, own, low, width = self._safe
         factor = xp.exp(xp.where(positive, z, 0.0))
         part = xp.exp(-xp.logaddexp(0.0, -(xp.where(bounded, z, 0.0) + own)))
@@ -117,9 +123,11 @@ class Unknowns:
 
     @cached_property
     def _safe(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Masks of the positive and the bounded, z + own as the logarithm or logit of their first guesses, bounds and widths.
+        """The masks of positive and of bounded parameters, and arrays `own`, `low` and `width` for the transforms.
 
-        All are finite for parameters of every kind: derivatives of JAX multiply those of the other kinds by zero.
+        `own` is the logarithm (positive) or the logit (bounded) of the first guess, to which z is added; `low` and `width` are
+        the lower bound and the width of the range. All numbers are finite for parameters of every kind, since derivatives of JAX
+        multiply the terms of the other kinds by zero.
         """
         kinds = np.array(self.kinds)
         positive, bounded = kinds == "positive", kinds == "bounded"
@@ -129,7 +137,7 @@ class Unknowns:
 
     @np.errstate(divide="ignore", invalid="ignore")
     def z_of(self, x: Float[np.ndarray, "... P"]) -> Float[np.ndarray, "... P"]:
-        """Return the unknowns z of parameters x; not finite for a value outside its bounds, or not positive."""
+        """Return the unknowns z of parameters x; they are not finite for a value outside its bounds, or not positive."""
         width = self.high - self.low
         bounded = logit((x - self.low) / width) - logit((self.guess - self.low) / width)
         return self._by_kind(np.log(x / self.guess), bounded, (x - self.guess) / self.scale)
@@ -141,12 +149,16 @@ class Unknowns:
     def stuck_at_bounds(
         self, z: Float[np.ndarray, "K"], r: Float[np.ndarray, "R"], J: Float[np.ndarray, "R K"], count: int
     ) -> Bool[np.ndarray, "K"]:
-        """Return which unknowns a fit pushes towards a bound, zero for positive parameters, without a visible effect.
-
-        The residuals, `count` in number, may be reduced to fewer (`reduce_rows`).
+        """Return a mask of the unknowns that a fit pushes towards a bound (zero for positive parameters) without visible effect.
 
         dr/dz vanishes at a bound, where z is infinite. The rest of the way to the bound changes the residuals by about dr/dz: if
         this is at most `BOUND_EFFECT` of the noise, or not visible at all, the parameter is as good as at the bound.
+
+        Args:
+            z: the unknowns.
+            r: residuals at z, which may be reduced to fewer (`reduce_rows`).
+            J: the Jacobian of r.
+            count: number of residuals before their reduction.
         """
         P = len(self.names)
         size, slope = np.linalg.norm(J, axis=0), (J.T @ r)[:P]
@@ -169,7 +181,7 @@ class Unknowns:
 
 
 def apply_values(mechanism: Any, targets: Sequence[Target], x: Float[Array, "P"] | np.ndarray) -> Any:
-    """Return the mechanism with values x (P,), which may be traced, assigned in the order of the parameters; pure."""
+    """Return the mechanism with values x (P,), which may be traced, assigned to targets in their order. The function is pure."""
     base, values = mechanism, {}
     for k, target in enumerate(targets):
         if target.function is not None:
@@ -181,9 +193,11 @@ def apply_values(mechanism: Any, targets: Sequence[Target], x: Float[Array, "P"]
 
 
 def sample_guesses(u: Unknowns, z: Float[np.ndarray, "K"], count: int, seed: int) -> Float[np.ndarray, "B K"]:
-    """Sample guesses around a first one: within a factor, or half of the scale; every second guess anywhere between bounds.
+    """Return `count` guesses sampled around a guess z.
 
-    Unknowns of initial states, which follow the parameters, are changed only slightly.
+    Positive and bounded parameters change by up to a factor of `GUESS_FACTOR` (of the odds, if bounded), free ones by up to half
+    of their scale; in every second guess, bounded parameters are anywhere between their bounds. Unknowns of initial states, which
+    follow the parameters, are changed only slightly.
     """
     P = len(u.names)
     unit = _latin_hypercube(count, len(z), seed)
@@ -198,7 +212,7 @@ def sample_guesses(u: Unknowns, z: Float[np.ndarray, "K"], count: int, seed: int
 
 
 def _latin_hypercube(count: int, dimensions: int, seed: int) -> Float[np.ndarray, "B K"]:
-    """Sample points of the unit cube, one in each of `count` parts of every coordinate; SciPy's function is slow to import."""
+    """Return `count` points of the unit cube, one in each of `count` parts of every axis; SciPy's function is slow to import."""
     random = np.random.default_rng(int(seed))
     parts = random.permuted(np.tile(np.arange(count), (dimensions, 1)), axis=1).T
     return (parts + random.random((count, dimensions))) / count
@@ -213,7 +227,7 @@ def with_conditions(mechanism: Any, record: Record) -> Any:
 
 
 def guessed_states(mechanism: StudyModel, records: Sequence[Record]) -> tuple[np.ndarray, np.ndarray] | tuple[None, None]:
-    """Return guesses q and v (records, bodies, 3) of initial states; None if all are the scene's guess."""
+    """Return guesses q and v (records, bodies, 3) of initial states; (None, None) if all are the scene's guess."""
     states = [record.start.state for record in records]
     if all(state is None for state in states):
         return None, None
@@ -224,7 +238,13 @@ def guessed_states(mechanism: StudyModel, records: Sequence[Record]) -> tuple[np
 
 
 def conditions_of(mechanism: StudyModel, records: Sequence[Record]) -> dict[str, np.ndarray | Held]:
-    """Return the values in all records of each parameter that differs between records, stacked; samples as one `Held`."""
+    """Return, for each parameter in the conditions of any record, its values in all records, stacked; samples as one `Held`.
+
+    Records without this condition have the scene's value.
+
+    Raises:
+        IdentificationError: lists every unknown name, and every value of a wrong shape.
+    """
     numbers, problems = mechanism.number_fields(), []
     conditions: dict[str, np.ndarray | Held] = {}
     for name in dict.fromkeys(name for record in records for name in record.conditions):
@@ -248,7 +268,7 @@ def conditions_of(mechanism: StudyModel, records: Sequence[Record]) -> dict[str,
 
 
 def _held_in_scene(mechanism: Any, samples: NumberField | None) -> Held | None:
-    """Return the `Held` that contains the samples; None if they are those of no `Held` of the scene."""
+    """Return the `Held` that contains the samples; None if the samples belong to no `Held` of the scene."""
     holder = samples.holder(mechanism.groups) if samples is not None and mechanism.has_bodies else None
     return holder if isinstance(holder, Held) else None
 
@@ -261,7 +281,7 @@ def _stacked(values: Sequence[Any], shape: tuple[int, ...]) -> np.ndarray:
 
 
 def _held_together(values: Sequence[Any], shape: tuple[int, ...]) -> Held:
-    """Return one `Held` with the samples of all records; fewer samples are continued by the last one, as is a number."""
+    """Return one `Held` with the samples of all records; shorter series and single numbers are continued by their last value."""
     times = {(value.dt, value.t0) for value in values if isinstance(value, Held)}
     if len(times) > 1:
         raise ValueError("held with the same `dt` and `t0` in all records: sample it again at equal times")

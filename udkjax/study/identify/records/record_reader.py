@@ -1,4 +1,4 @@
-"""Reads measurements from any kind of table into records; every mistake is reported with its file, row and column."""
+"""Reading of measurements from any kind of table into records; every mistake is reported with its file, row and column."""
 
 import math
 import os
@@ -66,7 +66,10 @@ def records_of(
 
 
 class _TableReader:
-    """Reads the records of one table. `channel` finds channels by name or raises ValueError; mistakes are added to `problems`."""
+    """A reader of the records of one table.
+
+    `channel` finds a channel by its name, or raises ValueError. Mistakes are added to `problems`.
+    """
 
     def __init__(self, table: Table, channel: Callable[[str], Channel | Quantity], ignore: Sequence[str], problems: list[str]):
         self.table, self.channel, self.problems = table, channel, problems
@@ -74,7 +77,7 @@ class _TableReader:
         self.ignore = ignore
 
     def records(self) -> Iterator[Record]:
-        """Iterate over the records."""
+        """Iterate over the records of the table; there are none once a mistake was found."""
         before = len(self.problems)
         time = next((name for name in TIME if name in self.columns), None)
         if time is None:
@@ -114,7 +117,10 @@ class _TableReader:
         return values, {key: self.numbers(h + NOISE, units, self.columns[h].units) for key, (h, units) in with_noise.items()}
 
     def numbers(self, heading: str, wanted: str, units: str | None = None) -> np.ndarray:
-        """Return the numbers of a column in SI units, from the column's units or else from `units`; gaps are NaN."""
+        """Return the numbers of a column in the units `wanted`; gaps are NaN.
+
+        They are converted from the units in the heading, or else from `units`; without either, they are not converted.
+        """
         cells, own = self.columns[heading]
         scale, count, units = 1.0, len(self.table.rows), own or units
         try:
@@ -155,7 +161,7 @@ class _TableReader:
         values: dict[ChannelKey, np.ndarray],
         noise: dict[ChannelKey, np.ndarray],
     ) -> Iterator[Record]:
-        """Return a record of some rows, with the channels that were measured in them."""
+        """Yield the record of the rows `places`, with the channels that were measured in them, if it is valid."""
         measured = [name for name, x in values.items() if not np.isnan(x[places]).all()]
         if self.table.padded and measured:
             # Rows at the ends without any value belong to longer records.
@@ -173,7 +179,7 @@ class _TableReader:
         self.problems.append(f"{self.table.source}, column {quote(heading)}: {problem}")
 
     def add_each(self, heading: str, rows: Sequence[int] | np.ndarray, problem: Callable[[int], str]) -> None:
-        """Report the same mistake in several rows: the first ones, and the number of the others."""
+        """Report the same mistake in several rows: one message for each of the first rows, and one that counts the others."""
         for k in rows[:MOST_SHOWN]:
             self.problems.append(f"{self.table.source}, {self.table.rows[k]}, column {quote(heading)}: {problem(k)}")
         if len(rows) > MOST_SHOWN:
@@ -191,7 +197,7 @@ def _number(cell: str | float | None) -> float:
 
 
 def _label(cell: str | float | None) -> str:
-    """Return the name of a record in a cell; empty if the cell is empty."""
+    """Return the name of a record in a cell; "" if the cell is empty."""
     if isinstance(cell, str):
         return cell.strip()
     return "" if cell is None or cell != cell else f"{cell:g}"
@@ -206,7 +212,7 @@ def _quantities_by_name(given: Iterable[Hashable]) -> dict[str, Quantity]:
 
 
 class _DataReader:
-    """Reads data for a mechanism, and collects every mistake in `problems`."""
+    """A reader of any kind of data for a mechanism, which collects every mistake in `problems`."""
 
     def __init__(self, mechanism: StudyModel, ignore: tuple[str, ...], quantities: dict[str, Quantity]):
         self.mechanism, self.ignore, self.quantities = mechanism, ignore, quantities
@@ -227,7 +233,7 @@ class _DataReader:
                 yield from _TableReader(table, self.channel, self.ignore, self.problems).records()
 
     def channel(self, given: ChannelKey) -> Channel | Quantity:
-        """Return the channel with a name, or a user-defined channel.
+        """Return the channel with the name `given`, or `given` itself if it is a user-defined channel.
 
         Raises:
             ValueError: there is no such channel.
@@ -236,7 +242,10 @@ class _DataReader:
         return channel_of(self.mechanism, str(given)) if quantity is None else quantity
 
     def by_channel(self, given: ByChannel[T], place: str) -> dict[ChannelKey, T]:
-        """Return the values by the canonical names of the channels; user-defined channels are keys themselves."""
+        """Return the values by the canonical names of the channels; user-defined channels are keys themselves.
+
+        Mistakes are reported at `place`.
+        """
         found: dict[ChannelKey, T] = {}
         for text, value in given.items():
             try:

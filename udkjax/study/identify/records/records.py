@@ -29,7 +29,7 @@ ByChannel: TypeAlias = Mapping[str, T] | Mapping[Quantity, T] | Mapping[ChannelK
 
 
 def _require_noise(name: str, value: Any, given: GivenArguments) -> None:
-    """Require numbers for all channels, or by channel, where None leaves a channel out."""
+    """Require a number or an array for all channels, or a mapping of channels to these; None stands for unknown noise."""
     by_channel = {f"{name}[{str(key)!r}]": x for key, x in value.items()} if isinstance(value, Mapping) else {name: value}
     for place, numbers in by_channel.items():
         if numbers is not None:
@@ -210,7 +210,7 @@ def labels(records: Sequence[Record]) -> list[str]:
 
 
 def output_times(record: Record) -> tuple[Float[np.ndarray, "T"], int]:
-    """Return the times of a record, from that of its initial state, and the index of the first measurement."""
+    """Return the times of a record, beginning with that of its initial state, and the index of the first measurement."""
     return (record.times, 0) if record.t0 == record.times[0] else (np.concatenate([[record.t0], record.times]), 1)
 
 
@@ -221,7 +221,10 @@ def pad_times(ts: Float[np.ndarray, "T"], length: int) -> Float[np.ndarray, "len
 
 
 def tabulate(records: Sequence[Record], keys: Sequence[ChannelKey]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Arrange records in tables of equal length: times (records, T), values and noise (records, T, C), NaN where unknown."""
+    """Return records as tables of equal length: times (records, T), values and noise (records, T, C), NaN where unknown.
+
+    C is the number of `keys`, the channels. Shorter records are padded.
+    """
     times = [output_times(record) for record in records]
     length = max(2, *(len(ts) for ts, _ in times))
     y, sigma = np.full((2, len(records), length, len(keys)), np.nan)

@@ -48,7 +48,10 @@ class Table(NamedTuple):
 
 
 def read_tables(data: TableData, bodies: Sequence[str], source: str, problems: list[str]) -> Iterator[Table]:
-    """Iterate over the tables of one file or object; its mistakes are added to `problems`."""
+    """Iterate over the tables of one file or object; mistakes in it are added to `problems`.
+
+    `bodies` are the names of the bodies whose states a dataset may contain, and `source` is the name of an object in messages.
+    """
     if isinstance(data, str | os.PathLike):
         yield from _read_file(Path(data), bodies, problems)
     elif hasattr(data, "data_vars"):
@@ -79,7 +82,7 @@ def _read_file(path: Path, bodies: Sequence[str], problems: list[str]) -> Iterat
 
 
 def _read_csv(path: Path, problems: list[str]) -> Iterator[Table]:
-    """Iterate over the table of a CSV file: optional comment lines, a header, and rows of cells."""
+    """Iterate over the only table of a CSV file: optional comment lines, a header, and rows of cells."""
     lines = path.read_text(encoding="utf-8-sig").splitlines()
     first = next((k for k, line in enumerate(lines) if line.strip() and not line.lstrip().startswith("#")), None)
     if first is None:
@@ -102,12 +105,12 @@ def _read_csv(path: Path, problems: list[str]) -> Iterator[Table]:
 
 
 def _cut_empty_end(cells: list[str]) -> list[str]:
-    """Remove empty cells at the end of a row, which spreadsheets write."""
+    """Return a row without the empty cells at its end, which spreadsheets write."""
     return cells[: max((k + 1 for k, cell in enumerate(cells) if cell.strip()), default=0)]
 
 
 def _join_points(cells: Sequence[str], delimiter: str) -> list[str]:
-    """Join headings that were split at the comma of a point, as in `body.rod(0.5, 0).x` without quotes."""
+    """Return headings, with those joined that were split at the comma of a point, as in `body.rod(0.5, 0).x` without quotes."""
     found: list[str] = []
     for cell in cells:
         if found and found[-1].count("(") > found[-1].count(")"):
@@ -147,7 +150,7 @@ def _table_of_columns(
 
 
 def _heading(text: str) -> tuple[str, str | None]:
-    """Split `body.link1.angle [deg]` into a name and units."""
+    """Return the name and the units of a heading such as `body.link1.angle [deg]`; the units are None if it has none."""
     is_plain = re.fullmatch(r"[qv]\[\d+\]", text.strip())  # a coordinate of a system
     match = None if is_plain else re.fullmatch(r"(.*?)\s*\[([^\[\]]*)\]", text.strip())
     return (match[1].strip(), match[2].strip() or None) if match else (text.strip(), None)
@@ -193,7 +196,7 @@ def _read_record(data: "xarray.Dataset", bodies: Sequence[str], source: str, pro
 def _state_columns(
     key: str, values: "xarray.DataArray", bodies: Sequence[str], source: str, problems: list[str]
 ) -> dict[str, TableColumn]:
-    """Return coordinates or velocities of bodies as columns."""
+    """Return the coordinates ("q") or velocities ("v") of bodies as columns, by the names of channels."""
     columns = {}
     for i, body in enumerate(map(str, values["body"].values)):
         if body not in bodies:

@@ -81,7 +81,8 @@ def fit_growing_records(
 ) -> Fit:
     """Fit longer and longer parts of the records from a guess, and then the whole records.
 
-    If the first part's fit equals that of an `earlier` fit from another guess, that fit is returned; otherwise this one is added.
+    If the fit of the first part ends where that of an `earlier` fit from another guess ended, the earlier fit is returned;
+    otherwise this fit is added to `earlier`.
     """
     noise = noise_of_records(problem) / problem.sigma
     regularized = RegularizedProblem(problem, z, noise)
@@ -132,7 +133,7 @@ def noise_of_records(problem: FitProblem) -> Float[np.ndarray, "R"]:
 def _predictable_time(regularized: RegularizedProblem, z: np.ndarray, tol: TolerancePair, fitted: float, size: float) -> float:
     """Return the time since the beginning of the records up to which a fit of the first `fitted` seconds predicts them.
 
-    `size` is the root mean square of the residuals of this fit.
+    It is infinite if the fit predicts the whole records. `size` is the root mean square of the residuals of this fit.
     """
     problem, times = regularized.problem, _times(regularized.problem)
     R, K = len(times), problem.K

@@ -56,7 +56,16 @@ def minimize_squares(
 ) -> Fit:
     """Minimize r.r / 2 from a first guess, until the (dimensionless) Gauss-Newton step is at most `step_tol`.
 
-    Unknowns that are `stuck` at a bound keep their values.
+    Args:
+        evaluate: the residuals as a function of the unknowns.
+        z: the first guess.
+        steps: maximum number of evaluations.
+        step_tol: largest change of an unknown in the next step at which the fit has converged.
+        report: called with a message after each step.
+        stuck: function that finds unknowns at a bound, which keep their values (`Unknowns.stuck_at_bounds`).
+
+    Returns:
+        The best point found.
     """
     from scipy.optimize import least_squares
 
@@ -70,7 +79,7 @@ def minimize_squares(
 
 
 class Descent:
-    """One fit in progress, whose best point is `end`; StopIteration ends it."""
+    """A fit in progress, whose best point is `end`. StopIteration, which `record` and `stop` raise, ends the fit."""
 
     def __init__(self, evaluate: Objective, guess: Float[np.ndarray, "K"], step_tol: float, report: ReportStep):
         self.evaluate, self.guess, self.step_tol, self.report = evaluate, guess, step_tol, report
@@ -85,7 +94,7 @@ class Descent:
             self.stop(True)
 
     def stop(self, converged: bool) -> NoReturn:
-        """End the fit."""
+        """End the fit by StopIteration, after setting `end.converged`."""
         self.end = self.end._replace(converged=converged)
         raise StopIteration
 
@@ -102,7 +111,7 @@ class _TrustRegionFit(Descent):
     refused = 0  # number of trials since the last improvement
 
     def residuals(self, change: Float[np.ndarray, "K"]) -> Float[np.ndarray, "2K+1"]:
-        """Return the residuals, reduced to K + 1, some of which may be zero; infinite if they cannot be computed."""
+        """Return the residuals, reduced to K + 1, then K zeros; the residuals are infinite if they cannot be computed."""
         z = self.guess + change
         reduced = reduce_blocks(self.evaluate(z[None])) if np.abs(z).max(initial=0.0) < FARTHEST_UNKNOWN else None
         self.r, self.J = np.full(len(z) + 1, np.inf if reduced is None else 0.0), np.zeros((len(z) + 1, len(z)))
@@ -136,7 +145,10 @@ class _TrustRegionFit(Descent):
 
 
 def gauss_newton(r: Float[np.ndarray, "R"], J: Float[np.ndarray, "R K"]) -> tuple[float, float]:
-    """Return the largest entry of the Gauss-Newton step in determined directions, and the cosine between r and the range of J."""
+    """Return the largest entry of the Gauss-Newton step in determined directions, and the cosine between r and the range of J.
+
+    Both are zero if J is zero, since all unknowns are then at a bound.
+    """
     if not J.any():
         return 0.0, 0.0  # every unknown is at a bound
     step, _, rank, _ = lstsq(J, r, cond=INVISIBLE_RATIO, lapack_driver="gelsy")

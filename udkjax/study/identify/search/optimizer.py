@@ -87,7 +87,11 @@ def squares(residuals: Residuals) -> Residuals:
 
 
 def named_loss(name: str, residuals: int) -> Loss:
-    """Return the loss with a name, applied to the first `residuals` of a problem, since priors are not outliers."""
+    """Return the loss with a name, which transforms the first `residuals` residuals only, since priors are not outliers.
+
+    Raises:
+        IdentificationError: there is no such loss.
+    """
     if name == "least_squares":
         return squares
     if name in ROBUST:
@@ -96,9 +100,12 @@ def named_loss(name: str, residuals: int) -> Loss:
 
 
 def robust(plain: Residuals, rho: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]], residuals: int) -> Residuals:
-    """Return s = sign(r) sqrt(rho(r)) and its Jacobian ds/dr J; s.s and its gradient equal those of the sum of rho.
+    """Return residuals s = sign(r) sqrt(rho(r)) and their Jacobian ds/dr J: s.s and its gradient equal those of the sum of rho.
 
-    `rho` returns rho(|r|) and half of its derivative.
+    Args:
+        plain: the residuals r and their Jacobian.
+        rho: function of |r| that returns rho(|r|) and half of its derivative.
+        residuals: the number of first residuals of the problem that are transformed.
     """
     residuals = plain.count_before(residuals)
     r = plain.r[:, :residuals]
@@ -116,7 +123,7 @@ def robust(plain: Residuals, rho: Callable[[np.ndarray], tuple[np.ndarray, np.nd
 
 
 def huber(size: np.ndarray, c: float = TUNING_CONSTANT) -> tuple[np.ndarray, np.ndarray]:
-    """Return rho(r) = r^2 up to |r| = c, and 2 c |r| - c^2 beyond; and half of its derivative.
+    """Return rho(r) = r^2 up to |r| = c, and 2 c |r| - c^2 beyond; and half of its derivative. `size` is |r|.
 
     Source: P. J. Huber, Robust estimation of a location parameter, 1964.
     """
@@ -124,7 +131,7 @@ def huber(size: np.ndarray, c: float = TUNING_CONSTANT) -> tuple[np.ndarray, np.
 
 
 def soft_l1(size: np.ndarray, c: float = TUNING_CONSTANT) -> tuple[np.ndarray, np.ndarray]:
-    """Return rho(r) = 2 c^2 ((1 + (r / c)^2)^(1/2) - 1), and half of its derivative."""
+    """Return rho(r) = 2 c^2 ((1 + (r / c)^2)^(1/2) - 1), and half of its derivative. `size` is |r|."""
     root = np.sqrt(1.0 + (size / c) ** 2)
     return 2.0 * size**2 / (root + 1.0), size / root
 
@@ -155,7 +162,13 @@ def weighted_residuals(problem: Evaluated, tol: TolerancePair, loss: Loss, horiz
 
 @dataclass(frozen=True)
 class Minimizer:
-    """The method of all fits of an identification: least squares (None), or a gradient method."""
+    """The method of all fits of an identification.
+
+    Attributes:
+        method: None for least squares, or a gradient method.
+        loss: transforms residuals so that the sum of squares is the loss.
+        report: called with a message after each step.
+    """
 
     method: GradientMethod | None = None
     loss: Loss = squares
@@ -223,7 +236,7 @@ def _update(optimizer: "optax.GradientTransformation", state, at, value, gradien
 
 
 class _LossDescent(Descent):
-    """A loss and its gradient, as a callback of optimizers."""
+    """A fit in progress, as a callback of optimizers that returns the loss rho and its gradient."""
 
     def __init__(self, rho: UserLoss, *fit: Any):
         super().__init__(*fit)

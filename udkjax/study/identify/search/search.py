@@ -37,7 +37,16 @@ SAME_MINIMUM_DISTANCE, SAME_PREDICTION = 1e-4, 0.1
 
 
 class SearchResult(NamedTuple):
-    """The best fit, how many of the first guesses led to it, and the strategies that were tried."""
+    """The best fit of a search.
+
+    Attributes:
+        fit: the best fit.
+        agreeing: number of first guesses that led to it.
+        guesses: number of first guesses.
+        ways: the strategies that were tried.
+        history: costs and steps of all fits.
+        problem: the fitted problem, which may be one in pieces.
+    """
 
     fit: Fit
     agreeing: int
@@ -108,7 +117,7 @@ def _best(fits: Sequence[Fit]) -> Fit:
 
 
 def count_agreeing(problem: FitProblem, fits: Sequence[Fit], tol: TolerancePair) -> int:
-    """Return the number of fits at the best minimum."""
+    """Return the number of fits at the same minimum as the best fit; 0 if no fit has a finite cost."""
     best, count = _best(fits), 0
     if not np.isfinite(best.cost):
         return count
@@ -127,7 +136,7 @@ def count_agreeing(problem: FitProblem, fits: Sequence[Fit], tol: TolerancePair)
 
 
 def _shows_most(problem: FitProblem, fit: Fit) -> bool:
-    """Return True if a fit reproduces most of the motion."""
+    """Return True if a fit reproduces most of the motion, with residuals that are small relative to the channels' scales."""
     scale = problem.channel_scale[problem.index[:, 2]] / problem.sigma
     return bool(2.0 * fit.cost < SHOWN_PART**2 * np.sum(scale**2))
 
@@ -137,7 +146,7 @@ def fit_in_pieces(
 ) -> SearchResult | None:
     """Fit the records in pieces, from the `most` best guesses in turn, until one explains the records; None if all fail.
 
-    The fit is of the whole records, unless the motion is too chaotic to integrate these accurately.
+    The result is then a fit of the whole records, unless the motion is too chaotic to integrate these accurately.
     """
     loose = max(tol[0], MEDIUM_TOL), max(tol[1], MEDIUM_TOL)
     for k, guess in enumerate(rank_guesses(problem, z, loose)[:most] if most else ()):
@@ -170,7 +179,7 @@ def is_chaotic(problem: FitProblem, z: Float[np.ndarray, "K"], tol: TolerancePai
 
 
 def rank_guesses(problem: FitProblem, z: Float[np.ndarray, "B K"], tol: TolerancePair) -> Float[np.ndarray, "B K"]:
-    """Return guesses, the best first, sorted by the residuals of the records and of their first parts, with equal weights."""
+    """Return guesses, the best first, ranked by residuals of the whole records and of their first parts, with equal weights."""
     record, time, _ = problem.index.T
     since, durations = problem.ts[record, time] - problem.ts[record, 0], horizons(problem)
     sums = np.zeros((len(durations), len(z)))
@@ -199,7 +208,7 @@ def horizons(problem: FitProblem) -> list[float]:
 
 
 def explains(problem: FitProblem, fit: Fit, tol: TolerancePair) -> bool:
-    """Return True if the residuals of a fit are only noise."""
+    """Return True if the residuals of a fit are only noise: small enough, or uncorrelated in time."""
     if not (np.isfinite(fit.cost) and fit.converged):
         return False
     r, ok = residual_vector(problem.row_blocks(fit.z[None], tol))

@@ -100,12 +100,12 @@ class MultipleShooting(FitProblem):
         self.guess, self.scale = self._guess_along(z, tol)
 
     def _unknowns_at(self, record: int, x: np.ndarray, t: float, guess: State | None) -> InitialStateUnknowns:
-        """Return the unknowns of a state of a record at a time t, with parameters x, near a guess."""
+        """Return the unknowns of the closed states near a guess, at a time t of a record, with parameters x."""
         mech = apply_values(with_conditions(self.mechanism, self.records[record]), self.unknowns.targets, x)
         return state_unknowns(mech, t, guess, "both", "start")
 
     def _begin_at(self, p: int, state: np.ndarray, x: np.ndarray) -> None:
-        """Set the guess of a piece's initial state to a closed state (2, n)."""
+        """Set the guess of the initial state of piece p to a closed state (2, n), with parameters x."""
         q, v = state.reshape(2, *self.mechanism.state_shape())
         basis = self._unknowns_at(self.pieces[p].record, x, float(self.runs.ts[p, 0]), State(q, v)).basis
         self.runs.bases[p], self.inverse[p] = basis, np.linalg.pinv(basis.reshape(-1, self.S))
@@ -117,9 +117,13 @@ class MultipleShooting(FitProblem):
             self.runs.v[p] += v - guess.v
 
     def _guess_along(self, z: np.ndarray, tol: TolerancePair) -> tuple[np.ndarray, np.ndarray]:
-        """Return unknowns with initial states of the pieces, computed in sequence, and the typical motion of coordinates (S,).
+        """Return the unknowns with initial states of the pieces, and the typical motion of coordinates in a piece (S,).
 
-        Each initial state is the final state of the previous piece, corrected to fit the piece's measurements.
+        The initial states are computed in sequence: each is the final state of the previous piece, corrected to fit the piece's
+        measurements.
+
+        Raises:
+            PieceFailed: a piece cannot be simulated.
         """
         P = len(self.unknowns.names)
         x = self.unknowns.values(z[:P])
@@ -143,7 +147,7 @@ class MultipleShooting(FitProblem):
         return self.predictor(self.members_of(np.full(len(shift), p), np.tile(x, (len(shift), 1)), shift), tol)
 
     def _residuals_of_piece(self, p: int, x: np.ndarray, tol: TolerancePair) -> Objective:
-        """Return the residuals of a piece as a function of its initial state, damped towards the end of the previous piece."""
+        """Return the residuals of a piece as a function of its initial state, damped towards the previous piece's final state."""
         rows, S, damping = np.flatnonzero(self.run == p), self.S, None
         entries, sigma, measured = (self.time[rows], self.index[rows, 2]), self.sigma[rows], self.measured[rows]
 
@@ -179,7 +183,7 @@ class MultipleShooting(FitProblem):
         return float(self.weight / np.median(self.sigma / self.channel_scale[self.index[:, 2]]))
 
     def gaps(self, z: np.ndarray, tol: TolerancePair) -> np.ndarray:
-        """Return the largest defect (B,), relative to the motion of coordinates in a piece."""
+        """Return the largest defect for each set of unknowns (B,), relative to the motion of coordinates in a piece."""
         defects = deque(self.row_blocks(z, tol), maxlen=1)[0]
         return np.abs(defects.r).max(1, initial=0.0) / self._defect_weight
 
