@@ -1,4 +1,4 @@
-"""Trajectories. Only this folder imports diffrax, and only when a run needs it."""
+"""Time integration: from a mechanism to its motion. Only this folder imports diffrax, and only when a run needs it."""
 
 from udkjax.lazy_names import lazy_names
 

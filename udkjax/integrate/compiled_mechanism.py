@@ -35,13 +35,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class RunPlan:
-    """The part of a run that depends on the structure of the mechanism and the choices, but not on numbers."""
+    """The static part of a run: it depends on the structure of the mechanism and on the choices, but not on numbers."""
 
-    solver: "diffrax.AbstractSolver | None"
-    projected: bool
+    solver: "diffrax.AbstractSolver | None"  # None: the default
+    projected: bool  # whether each step is projected onto the constraints
     operation: RunStates | None  # the machine code that integrates the mechanism
     evaluation: Accelerate | None  # the machine code that evaluates its equations for diffrax; None: `TextbookEquations` in JAX
-    why_not_native: str  # the reason why machine code does not integrate; empty if it does
+    why_not_native: str  # the reason why machine code does not integrate; "" if it does
     independent_rows: int = 0  # the number of rows that the method uses
     most_rank: int = 0  # the number of rows not known to be redundant: a larger rank is due to rounding or violated rows
     orders_by_diffrax: float = (
@@ -50,17 +50,17 @@ class RunPlan:
 
     @cached_property
     def is_native(self) -> bool:
-        """True if machine code integrates."""
+        """True if machine code integrates the run."""
         return not self.why_not_native
 
     @property
     def differentiates(self) -> bool:
-        """True if machine code has derivatives of the run: diffrax has those through a stabilization of the user's."""
+        """True if machine code computes the derivatives of the run; diffrax computes those with a user-defined stabilization."""
         return self.is_native and self.operation is not None and self.operation.stabilization is None
 
     @cached_property
     def has_timed_pieces(self) -> bool:
-        """True if the smooth piece of an element depends on time, so that the rate of the state alone does not lead across."""
+        """True if the smooth piece of an element depends on time, too: machine code then has no second derivatives of a run."""
         code = self.operation.code if self.operation else None
         return code is not None and code.piece_count > 0 and "t" in code.of("pieces").arrays
 
@@ -72,13 +72,13 @@ class RunPlan:
 
     @cached_property
     def shares_by_marks(self) -> bool:
-        """True if redundant rows share the loads of joints with friction, and marks tell which these are."""
+        """True if redundant rows share the loads of joints with friction, and are distinguished by their marks."""
         operation = self.operation or self.evaluation
         return operation is not None and operation.code.shares_by_marks
 
     @cached_property
     def weighs_rows(self) -> bool:
-        """True if known redundant rows share the loads of joints with friction: marks are then the weights of the rows."""
+        """True if known redundant rows share the loads of joints with friction: the weights of rows then replace their marks."""
         operation = self.operation or self.evaluation
         return operation is not None and operation.code.weighs_rows
 
@@ -97,12 +97,12 @@ class CompiledMechanism:
 
     @property
     def samples(self) -> SampleRows:
-        """The rows of all sampled numbers."""
+        """The sampled numbers of the mechanism as rows, one for each interval between breakpoints."""
         return SampleRows(self.textbook.mechanism, self.breakpoints)
 
     @cached_property
     def textbook(self) -> Any:
-        """The equations, without the formulation that may contain them."""
+        """The equations of the mechanism or user-defined system itself, without a formulation that may wrap them."""
         return self.equations.textbook
 
 
@@ -118,7 +118,9 @@ def compile_mechanism(
     engine: str = "auto",
     stepper: Any = None,
 ) -> CompiledMechanism:
-    """Prepare a mechanism, or a user-defined system, for runs; the arguments are those of `simulate`.
+    """Prepare a mechanism, or a user-defined system, for runs.
+
+    The arguments are those of `simulate`; `meter` is the progress meter, and `stepper` the step size controller.
 
     Raises:
         ValueError: machine code was requested but cannot integrate the system.
@@ -153,9 +155,10 @@ def compile_mechanism(
 
 
 def _orders_by_diffrax(system: Any, projected: bool) -> float:
-    """Return the highest order of derivatives that diffrax, which steps across the ends of pieces, computes right.
+    """Return the highest order of derivatives that diffrax, which steps across the ends of smooth pieces, computes right.
 
-    There derivatives of the second order jump. Projection makes a jump right that follows from the constraints alone.
+    At the ends of pieces derivatives of the second order jump. With projection, those jumps are right that follow from the
+    constraints alone.
     """
     if not _is_piecewise(system):
         return np.inf
@@ -163,13 +166,16 @@ def _orders_by_diffrax(system: Any, projected: bool) -> float:
 
 
 def _is_piecewise(system: Any) -> bool:
-    """Return whether constraints or loads of a mechanism are only piecewise smooth in the state."""
+    """Return True if a constraint or a force of a mechanism is only piecewise smooth in the state."""
     return any(map(has_pieces, (*system.constraints.values(), *system.forces.values())))
 
 
 @cached_by_identity
 def compile_concrete(system: Any, *choices: Any) -> CompiledMechanism:
-    """Return `compile_mechanism` of concrete numbers, with NumPy arrays: JAX would compile a program for each operation."""
+    """Return a system of concrete numbers, compiled, with NumPy arrays, since JAX would compile a program for each operation.
+
+    The `choices` are the arguments of `compile_mechanism` after the system.
+    """
     compiled = compile_mechanism(system.without_origin, *choices)
     return jax.tree.map(lambda x: np.asarray(x) if eqx.is_array(x) else x, compiled)
 
@@ -181,7 +187,7 @@ def _reason_for_diffrax(
     meter: "diffrax.AbstractProgressMeter | None",
     stepper: Any,
 ) -> str:
-    """Return why machine code cannot integrate such equations, whatever the scene; empty if it can."""
+    """Return the reason why machine code cannot integrate equations of this kind, whatever the scene; "" if it can."""
     if adjoint is not None:
         return f"{type(adjoint).__name__} is an adjoint of diffrax"
     if meter is not None:
@@ -198,7 +204,7 @@ def _reason_for_diffrax(
 
 
 def _reason_for_stabilization(equations: AbstractSystem, solver: Any, stabilization: Stabilization) -> str:
-    """Return why machine code cannot integrate equations with any user-defined stabilization; empty if it can."""
+    """Return the reason why machine code cannot integrate equations with any user-defined stabilization; "" if it can."""
     name = type(stabilization).__name__
     if equations.solves_constraints:
         return f"it partitions coordinates without {name}"
@@ -206,7 +212,7 @@ def _reason_for_stabilization(equations: AbstractSystem, solver: Any, stabilizat
 
 
 def _stabilized(operation: RunStates, stabilization: Stabilization) -> tuple[RunStates, str]:
-    """Return an operation with a user-defined stabilization, or why it has no machine code."""
+    """Return the operation with a user-defined stabilization, and the reason why it has no machine code; "" if it has."""
     try:
         return operation.stabilized(stabilization, overridden(stabilization)), ""
     except UnsupportedError as unknown:
@@ -214,7 +220,7 @@ def _stabilized(operation: RunStates, stabilization: Stabilization) -> tuple[Run
 
 
 def _reason_for_equations(equations: AbstractSystem) -> str:
-    """Return why machine code cannot evaluate such equations, whatever the scene; empty if it can."""
+    """Return the reason why machine code cannot evaluate equations of this kind, whatever the scene; "" if it can."""
     plain, formulation = equations.textbook, formulation_of(equations)
     if plain.programs is None and jax.config.jax_enable_x64:
         return f"it does not know {type(plain).__name__}"
@@ -227,7 +233,7 @@ def _reason_for_equations(equations: AbstractSystem) -> str:
 
 
 def reason_for_plain(method: Pseudoinverse, formulation: Formulation | None = None) -> str:
-    """Return why machine code cannot evaluate equations by a method and a formulation, whatever the scene; empty if it can."""
+    """Return the reason why machine code cannot evaluate equations by this method and formulation in any scene; "" if it can."""
     try:
         MethodCode.of(method, formulation)
     except UnsupportedError as unknown:
@@ -238,7 +244,7 @@ def reason_for_plain(method: Pseudoinverse, formulation: Formulation | None = No
 
 
 def _reason_for_programs(operation: RunStates | Accelerate) -> str:
-    """Return why machine code cannot be written for the programs of an operation; empty if it can."""
+    """Return the reason why the programs of an operation cannot be written as machine code; "" if they can."""
     code, formulation = operation.code, operation.formulation
     if code.excess:
         return code.excess
@@ -249,12 +255,12 @@ def _reason_for_programs(operation: RunStates | Accelerate) -> str:
 
 
 def formulation_of(equations: AbstractSystem) -> Formulation | None:
-    """Return the formulation that contains equations; None for the Udwadia-Kalaba equation."""
+    """Return the formulation by which equations are solved; None for the Udwadia-Kalaba equation."""
     return getattr(equations, "formulation", None)  # a field of the equations that formulations wrap
 
 
 def eliminates(method: Pseudoinverse) -> bool:
-    """Return whether a method eliminates rows and leaves out the redundant ones."""
+    """Return True if a method solves the equations by elimination, and leaves out redundant rows."""
     return isinstance(method, Auto | Elimination)
 
 
@@ -273,7 +279,7 @@ def _run_operation(equations: AbstractSystem, solver: Any, projected: bool, brea
 
 
 def _method_code(equations: AbstractSystem) -> MethodCode:
-    """Return the machine code of the method and the formulation of equations."""
+    """Return the `MethodCode` of the method and the formulation of equations."""
     return MethodCode.of(equations.textbook.method, formulation_of(equations))
 
 

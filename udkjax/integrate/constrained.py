@@ -20,9 +20,9 @@ class Constrained(Wrapper):
     next step (FSAL), belongs to the state before projection. `made_jump` therefore makes the solver compute a new derivative.
     (A multistep method would discard its whole history: its `made_jump` is unchanged, since it detects that its newest point
     moved.) The part of an error that projection removes has a small weight. If only some coordinates are integrated, only their
-    errors count.
-    Error estimates, with their counts, and interpolation are those of the wrapped solver. A user-defined `Stabilization`
-    changes the rates within a step, or the state at its end.
+    errors are controlled. All else, such as interpolation, is done by the wrapped solver. Error estimates are returned as
+    `Tally`s, with the number of right-hand sides. A user-defined `Stabilization` changes the rates within a step, or the state
+    at its end.
     """
 
     solver: diffrax.AbstractSolver
@@ -51,7 +51,7 @@ class Constrained(Wrapper):
 
 
 class _PartialNorm(eqx.Module):
-    """A norm of vectors in which only some `components` count."""
+    """A norm of vectors that takes only the masked `components` into account."""
 
     norm: Callable[[Float[Array, "2n"]], Float[Array, ""]]
     components: Bool[Array, "2n"]
@@ -61,7 +61,7 @@ class _PartialNorm(eqx.Module):
 
 
 def _with_partial_norm(solver: diffrax.AbstractSolver, components: Bool[Array, "2n"]) -> diffrax.AbstractSolver:
-    """Return a solver; the norm of a multistep method, which controls its own errors, is limited to `components`."""
+    """Return a solver; if it is a multistep method, which controls its own errors, limit their norm to `components`."""
     if not isinstance(solver, Multistep):
         return solver
     return eqx.tree_at(lambda s: s.root_finder.norm, solver, _PartialNorm(solver.root_finder.norm, components))

@@ -32,8 +32,11 @@ SMOOTH = tuple(IntegratorOutput._fields.index(name) for name in ("q", "v", "y"))
 def differentiable(problem: Problem, has_fixed_times: bool = False) -> IntegratorOutput:
     """Integrate a problem by machine code or with diffrax, with derivatives of any order of q, v and y.
 
-    There are no derivatives with respect to the numbers of the step controller (the sizes of steps are held constant), nor with
-    respect to fixed times: those that were concrete before the problem was traced, or do not change.
+    There are no derivatives with respect to the numbers of the step controller: the sizes of steps are held constant.
+
+    Args:
+        problem: the problem.
+        has_fixed_times: whether `problem.ts`, although traced, needs no derivatives: it was concrete when `simulate` was called.
     """
     control = {name: stop_gradients(getattr(problem, name)) for name in CONTROL}
     problem = replace(problem, **control)
@@ -59,13 +62,13 @@ def _(primals, tangents):
     shapes = eqx.filter_eval_shape(_run, *primals)
 
     def in_parts(at: Any, direction: list[Array]) -> tuple[list[Any], list[Any]]:
-        """Return the run, and a linear map of the direction."""
+        """Return the run, and its change along the direction as a linear map, which JAX can transpose for reverse mode."""
         raw, recorded = at[0].recorded(stop_gradients(at[1]), active)
         linear = Linear(function=at[0], inputs=at[1], run=recorded, active=active)
         return list(_as_run(*at, raw)), defined_along(linear.applied, direction, [raw[k] for k in SMOOTH])
 
     def at_once(at: Any, direction: list[Array]) -> tuple[list[Any], list[Any]]:
-        """Return the run, and its change along the direction, by forward mode."""
+        """Return the run, and its change along the direction, both computed in one run of forward mode."""
         function, inputs = at
         raw, change = function.run_and_jvp(inputs, active, direction)
         return list(raw), [jnp.where(jnp.isnan(raw[k]), jnp.nan, dx) for k, dx in zip(SMOOTH, change, strict=True)]
@@ -93,7 +96,7 @@ def _(primals, tangents):
 
 
 class DifferentiableRun(DifferentiableFunction):
-    """Positions and velocities at the output times, and at the end, as a function of the numbers of a problem.
+    """A run as a function from the numbers of a problem to [q, v, y]: the states at the output times and at the end.
 
     Third and higher derivatives are computed by diffrax.
     """
@@ -168,9 +171,9 @@ class DifferentiableRun(DifferentiableFunction):
         return raw, [change[k] for k in SMOOTH]
 
     def recorded(self, inputs: list[Array], active: Mask) -> tuple[IntegratorOutput, "native_engine.RecordedRun | tuple[()]"]:
-        """Return the run, and the record of it that reverse mode goes back through; diffrax records nothing.
+        """Return the run, and its record for reverse mode by machine code; the record is () if diffrax integrates.
 
-        Only the machine code of reverse mode is compiled.
+        The machine code of reverse mode computes both, so that no other code has to be compiled.
         """
         if self._is_native(inputs, active):
             raw, run = native_engine.integrate_for_vjp(self.problem(inputs), self.problem.marks(active))
@@ -178,7 +181,7 @@ class DifferentiableRun(DifferentiableFunction):
         return integrate_by_diffrax(self.problem(inputs)), ()
 
     def _own(self, inputs: list[Array], raw: IntegratorOutput) -> IntegratorOutput:
-        """Return the output of a run by its own formulation; `raw` is that of the run whose derivatives it has."""
+        """Return the output of a run by its own formulation; `raw` may be by that of its derivatives (`RunStates.closes`)."""
         operation = self.problem.rest.compiled.plan.operation
         return self.fast(inputs) if operation is not None and operation.closes else raw
 
@@ -197,7 +200,7 @@ class DifferentiableRun(DifferentiableFunction):
 
 
 def integrate_by_diffrax(problem: Problem, adjoint: Any = "ForwardMode", meter: Any = None) -> IntegratorOutput:
-    """Integrate by diffrax (diffrax_engine.py), imported only here, since its import takes as long as that of JAX.
+    """Integrate by diffrax (diffrax_engine.py), which is imported only here: its import takes as long as that of JAX.
 
     Args:
         problem: the problem.

@@ -86,9 +86,10 @@ def integrate_by_diffrax(
 
 
 def _misses_rows(problem: Problem, equations: TextbookEquations, ts: Array, ys: Array, step: Array) -> Bool[Array, "T"]:
-    """Return at which outputs projected velocities would open Psi too far in a step, as rows were left out.
+    """Return a mask of the outputs at which the velocities would open Psi too far within a step of the length `step` (s).
 
-    Machine code applies the same rule at the end of each step. The first state is given, not projected.
+    Projected velocities do so if independent rows were left out. Machine code applies the same rule at the end of each step. The
+    first output, the given state, is never marked, since its velocities were not projected.
     """
 
     def misses(at: tuple[Array, Array]) -> Array:
@@ -114,7 +115,7 @@ def _leave_breakpoints(problem: Problem) -> Float[Array, "T"]:
 
 
 def derivative(t: Float[ArrayLike, ""], y: Float[Array, "2n"], equations: AbstractSystem) -> Float[Array, "2n"]:
-    """Return (v, a)."""
+    """Return the time derivative of y = (q, v): (v, a), or the rates that the equations have integrated instead."""
     return jnp.concatenate(equations.rates(t, *jnp.split(y, 2)))
 
 
@@ -128,8 +129,8 @@ def _first_step(problem: Problem, equations: AbstractSystem, y0: Array) -> Array
 def first_step(y: Array, slope: Array, span: Array, rtol: Array, atol: Array, unit: Array) -> Array:
     """Return a step over which the state y (n,), with this slope, changes by a hundredth of itself or, if more, of its unit.
 
-    As in Hairer, Norsett, Wanner, II.4, without the second evaluation: the controller corrects the step. The unit, that of
-    `atol`, is needed for states that are zero, exactly or up to rounding.
+    As in Hairer, Norsett, Wanner, II.4, without the second evaluation: the controller corrects the step. The `unit`, in which
+    `atol` is given, is needed for states that are zero, exactly or up to rounding.
     """
     y, slope, span, rtol, atol, unit = stop_gradients((y, slope, span, rtol, atol, unit))
     scale = atol * unit + rtol * jnp.abs(y)
@@ -151,7 +152,10 @@ def _controller(problem: Problem) -> diffrax.AbstractStepSizeController:
 
 
 def _given_controller(problem: Problem) -> diffrax.AbstractStepSizeController | None:
-    """Return the step size controller that was given; adaptive ones also step to breakpoints."""
+    """Return the step size controller that was given, None if there is none.
+
+    An adaptive one also steps to breakpoints; one without tolerances gets those of the run, which root finders need.
+    """
     given, breakpoints = problem.stepper, problem.compiled.breakpoints
     if given is not None and not isinstance(given, diffrax.AbstractAdaptiveStepSizeController):
         return _WithTolerances(
@@ -163,7 +167,7 @@ def _given_controller(problem: Problem) -> diffrax.AbstractStepSizeController | 
 
 
 class _WithTolerances(diffrax.AbstractAdaptiveStepSizeController):
-    """A step size controller without tolerances, such as that of constant steps, with those of the root finders of solvers."""
+    """A step size controller that has no tolerances, such as `ConstantStepSize`, with tolerances for root finders of solvers."""
 
     controller: diffrax.AbstractStepSizeController
     rtol: Array

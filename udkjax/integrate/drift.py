@@ -1,4 +1,4 @@
-"""Reasons for which runs by integrators of diffrax end: drift beside singular configurations, and ranks that are too large."""
+"""Rules that end runs by diffrax: too much drift, in particular near singular configurations, and ranks that are too large."""
 
 from dataclasses import replace
 from typing import NamedTuple
@@ -26,7 +26,10 @@ ASIDE = CLOSURE.aside
 
 
 def distance(equations: AbstractSystem, t: Float[ArrayLike, ""], y: Float[Array, "2n"]) -> Float[Array, ""]:
-    """Return the smallest nonzero singular value of A M^(-1/2), with rows of length one, at a state y."""
+    """Return the distance of a state y = (q, v) from singular configurations, from 0 to 1.
+
+    It is the smallest nonzero singular value of A M^(-1/2) with rows of length one.
+    """
     M, _, A, _ = equations.matrices(t, *jnp.split(y, 2))
     gram = A @ jnp.linalg.solve(M, A.T)
     length = jnp.sqrt(jnp.diagonal(gram))
@@ -36,7 +39,7 @@ def distance(equations: AbstractSystem, t: Float[ArrayLike, ""], y: Float[Array,
 
 
 def most_rank(problem: Problem, equations: TextbookEquations) -> Float[Array, ""]:
-    """Return the number of independent rows along a motion, which the rank of D does not exceed."""
+    """Return the largest number of independent rows along a motion; a larger rank of D is due to rounding or violated rows."""
     if equations.redundant is not None:
         return jnp.asarray(float(len(equations.scales.rows) - len(equations.redundant)))
     if problem.marks is not None:
@@ -45,7 +48,10 @@ def most_rank(problem: Problem, equations: TextbookEquations) -> Float[Array, ""
 
 
 def _rank_near_start(problem: Problem, equations: TextbookEquations) -> Float[Array, ""]:
-    """Return the rank at the start or, if it is larger, one step away from it, as machine code finds it (row_marks.py)."""
+    """Return the larger one of the ranks of D at the start and at a closed position nearby, as in machine code (row_marks.py).
+
+    If no such position is found, return the number of all rows.
+    """
     scales, t, q, v = equations.scales, problem.ts[0], problem.q, problem.v
     by_rank = replace(equations, method=SVD(equations.rank_tol))
     random = np.random.default_rng(0).uniform(-1.0, 1.0, len(q)) * scales.coordinates(len(q))
@@ -62,9 +68,9 @@ def _rank_near_start(problem: Problem, equations: TextbookEquations) -> Float[Ar
 
 
 class DriftState(NamedTuple):
-    """State of a `DriftController`: that of the wrapped controller, the largest distance so far, and the status."""
+    """The state of a `DriftController`."""
 
-    inner: PyTree
+    inner: PyTree  # state of the wrapped controller
     farthest: Float[Array, ""]  # largest distance from singular configurations so far
     status: Int[Array, ""]  # RUNNING, LOST or SINGULAR
 

@@ -35,12 +35,12 @@ FALLBACK_RANK_SHARE = 0.06
 
 
 def packed(problem: Problem) -> list[np.ndarray]:
-    """Return the inputs of the run of a problem with concrete numbers."""
+    """Return the inputs of the machine code that integrates a problem of concrete numbers, by NumPy, as `run_inputs`."""
     return run_inputs(problem, _operation(problem), np)
 
 
 def integrate_concrete(problem: Problem) -> IntegratorOutput:
-    """Integrate a problem with concrete numbers without tracing anything: `IntegratorOutput` of NumPy arrays."""
+    """Integrate a problem of concrete numbers without tracing anything; the output has NumPy arrays."""
     operation = _operation(problem)
     return integrator_output(call_concrete(operation, run_inputs(problem, operation, np), len(problem.ts)))
 
@@ -52,15 +52,18 @@ def integrate(problem: Problem) -> IntegratorOutput:
 
 
 class RecordedRun(NamedTuple):
-    """The record of a run, through which reverse mode goes back."""
+    """The record of a run from which reverse mode computes its derivatives, backwards from the end."""
 
-    steps: Array  # accepted steps (1,)
+    steps: Array  # number of accepted steps (1,)
     record: Array
     states: tuple[Array, ...]  # q and v (T, n) if T > 2, else empty
 
 
 def integrate_for_vjp(problem: Problem, active: Problem) -> tuple[IntegratorOutput, RecordedRun]:
-    """Integrate a problem, and return its output with the record that `vjp` needs; both run the same compiled code."""
+    """Integrate a problem, and return its output with the record that `vjp` needs; `vjp` calls the same compiled code.
+
+    `active` is a tree like the problem, with True for the numbers whose derivatives are needed.
+    """
     operation, n, times = _operation(problem, active, reverse=True), len(problem.q), len(problem.ts)
     empty = (np.zeros(shape) for shape in ((1, 0), (1, 0), (1, 0, n), (1, 0, n), (0, times, 2 * n), (0, 2 * n)))
     results = native_p.bind(*run_inputs(problem, operation), *empty, operation=operation, times=times)
@@ -69,31 +72,37 @@ def integrate_for_vjp(problem: Problem, active: Problem) -> tuple[IntegratorOutp
 
 
 def serves_derivatives(active: Problem) -> bool:
-    """Return whether machine code has all `active` derivatives; it has those with respect to scene, gains and initial state."""
+    """Return True if machine code has all derivatives with respect to numbers that are True in `active`, a tree like a problem.
+
+    It has those with respect to numbers of the scene, gains of Baumgarte's stabilization, and the initial state.
+    """
     supported = lambda p: (p.textbook.mechanism, p.textbook.baumgarte, p.q, p.v)  # noqa: E731
     others = eqx.tree_at(supported, active, (None,) * 4, is_leaf=lambda x: x is None)
     return not any(x is True for x in jax.tree.leaves(others))
 
 
 def _numbers_of(problem: Any, change: Any = None) -> tuple[Any, Any, Any]:
-    """Return the numbers of a run, or a change of these, with zeros instead of sampled quantities."""
+    """Return the mechanism, with a row of zeros for its samples, the gains and the marks of a run; or a change of these."""
     source = problem if change is None else change
     return problem.compiled.samples.stand_in(source.textbook.mechanism), source.textbook.baumgarte, source.marks
 
 
 def _active_numbers(problem: Any, active: Any) -> ActiveNumbers:
-    """Return the numbers of a run, with the mask of the active ones."""
+    """Return the numbers of a run with a mask of those that are True in `active`, a tree like the problem."""
     mask = problem.compiled.samples.stand_in(active.textbook.mechanism, marks=True), active.textbook.baumgarte, active.marks
     return ActiveNumbers(_numbers_of(problem), mask)
 
 
 def jvp(problem: Problem, active: Any, change: Any) -> tuple[IntegratorOutput, tuple[Array, Array, Array]]:
-    """Integrate a problem; also return the changes of positions, velocities and end along a `change` of the active numbers."""
+    """Integrate a problem; also return the changes of q, v and the end along a `change` of the active numbers.
+
+    Both `active` and `change` are trees like the problem: with True for active numbers, and with their changes.
+    """
     return _integrate_along(problem, [(active, change)], _operation(problem, active))
 
 
 def second_derivative(problem: Problem, active: Any, *changes: tuple[Any, Any]) -> tuple[Array, Array, Array]:
-    """Return the second derivatives of positions, velocities and end along two `changes`: pairs (active numbers, change)."""
+    """Return the second derivatives of q, v and the end along two `changes`, each a pair (active, change) as in `jvp`."""
     operation = _operation(problem).with_second_tangents(_active_numbers(problem, active).mask)
     return _integrate_along(problem, changes, operation)[1]
 
@@ -116,7 +125,15 @@ def _integrate_along(
 
 
 def vjp(problem: Problem, active: Any, run: RecordedRun, ys: Array, end: Array) -> Problem:
-    """Return the cotangents of the `active` numbers, from cotangents of the output states (T, 2n) and of the end (2n,)."""
+    """Return the cotangents of the `active` numbers, as a tree like the problem, None for all other numbers.
+
+    Args:
+        problem: the problem.
+        active: a tree like the problem, with True for active numbers.
+        run: the record of the run.
+        ys: cotangents of the output states (T, 2n).
+        end: cotangents of the state at the end (2n,).
+    """
     operation = _operation(problem, active, reverse=True)
     states: Any = run.states or [np.zeros((len(problem.ts), len(problem.q)))] * 2
     inputs = [x[None] for x in (run.steps, run.record, *states, ys, end)]
@@ -134,7 +151,7 @@ def vjp(problem: Problem, active: Any, run: RecordedRun, ys: Array, end: Array) 
 
 
 def _operation(problem: Problem, active: Problem | None = None, reverse: bool = False) -> RunStates:
-    """Return the operation of a problem: a run, with tangents or cotangents if there are active numbers."""
+    """Return the machine code of a run, with tangents, or with cotangents if `reverse`, unless `active` is None."""
     run = problem.compiled.plan.operation
     assert run is not None  # checked by the caller
     if active is None:
@@ -147,7 +164,7 @@ def _operation(problem: Problem, active: Problem | None = None, reverse: bool = 
 
 
 def run_inputs(problem: Problem, operation: RunStates, xp: ModuleType = jnp) -> list[Any]:
-    """Return the inputs of machine code for one member."""
+    """Return the inputs of an operation for the run of a problem, each with a leading axis for its one member."""
     compiled = problem.compiled
     scene = _concrete_inputs_of_run(compiled) if xp is np else _inputs_of_run(compiled, operation.code.policy)
     settings = scene.settings | {
@@ -169,7 +186,7 @@ def run_inputs(problem: Problem, operation: RunStates, xp: ModuleType = jnp) -> 
 
 
 class SceneInputs(NamedTuple):
-    """The inputs of machine code that follow from the equations of a mechanism; they do not depend on states."""
+    """The inputs of machine code that follow from the equations of a mechanism alone, not from times and states."""
 
     numbers: list[Any]  # all numbers of the scene, and the gains
     thresholds: list[Any]  # two thresholds of pivots
@@ -180,7 +197,14 @@ class SceneInputs(NamedTuple):
 
 
 def scene_inputs(equations: AbstractSystem, mechanism: Mechanism, policy: RankPolicy, xp: ModuleType = jnp) -> SceneInputs:
-    """Return the inputs that follow from equations; `mechanism` has the numbers, without samples or at a given time."""
+    """Return the inputs of machine code that follow from equations.
+
+    Args:
+        equations: the equations.
+        mechanism: the mechanism whose numbers are the inputs, with one row instead of samples, or at a given time.
+        policy: the policy for rows of deficient rank, on which one of the thresholds of pivots depends.
+        xp: jax.numpy, or NumPy if all numbers are concrete.
+    """
     textbook = equations.textbook
     method: Any = textbook.method
     rank_tol = method.rank_tol
@@ -206,7 +230,7 @@ def _inputs_of_run(compiled: CompiledMechanism, policy: RankPolicy, xp: ModuleTy
 
 @cached_by_identity
 def _concrete_inputs_of_run(compiled: CompiledMechanism) -> SceneInputs:
-    """Return the inputs of a run with concrete numbers, as one vector."""
+    """Return the inputs of runs of a mechanism of concrete numbers, which are joined in one vector."""
     assert compiled.plan.operation is not None  # checked by the caller
     inputs = _inputs_of_run(compiled, compiled.plan.operation.code.policy, np)
     return inputs._replace(numbers=[numbers_as_vector(inputs.numbers)])
@@ -223,10 +247,11 @@ def mark_rows(
     among: Any = None,
     on: Any = None,
 ) -> Any:
-    """Return a mark for each row of Psi, 1 if it is independent near a state; None if the compiled code contains the marks.
+    """Return a mark for each row of Psi: 1 if it is independent near a state, else 0. None if machine code needs no marks.
 
-    If redundant rows share the loads of joints with friction, the marks of those `on` are -1; or, if the compiled code contains
-    the marks, the weights of all rows are returned instead.
+    If redundant rows share the loads of joints with friction, and marks distinguish them (`RunPlan.shares_by_marks`), a redundant
+    row that holds has the mark -1. If the redundant rows are known (`RunPlan.weighs_rows`), the weights of all rows are returned
+    instead of marks.
 
     Args:
         compiled: The mechanism.

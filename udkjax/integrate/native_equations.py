@@ -1,6 +1,6 @@
 """The equations of motion by machine code, for integrators in Python: accelerations and projections as functions of a state.
 
-Both are primitives of JAX with a batching rule. Their derivatives, of any order, are those of the textbook equations.
+Both functions are primitives of JAX with a batching rule. Their derivatives, of any order, are those of `TextbookEquations`.
 """
 
 from collections.abc import Sequence
@@ -34,10 +34,10 @@ from udkjax.transforms.gradients import stop_gradients
 
 
 class NativeEquations(WrappedSystem):
-    """Textbook equations whose accelerations and projections are machine code."""
+    """`TextbookEquations` whose accelerations and projections are computed by machine code."""
 
     equations: TextbookEquations
-    marks: Float[Array, "m"] | None  # of independent rows; None if the machine code contains them
+    marks: Float[Array, "m"] | None  # of the rows, from `mark_rows`; None if the machine code needs none
     scene: SceneInputs  # at time zero: computed once, not in every step
     operation: Accelerate = eqx.field(static=True)
 
@@ -67,7 +67,7 @@ class NativeEquations(WrappedSystem):
 
     @property
     def differentiated(self) -> TextbookEquations:
-        """The equations to differentiate: SVD replaces several methods, since at constant rank all have the same derivatives."""
+        """The equations that JAX differentiates: SVD replaces `OneOf`, as all methods have equal derivatives at constant rank."""
         method = self.equations.method
         return (
             replace(self.equations, method=SVD(method.rank_tol, method.relative)) if isinstance(method, OneOf) else self.equations
@@ -75,7 +75,7 @@ class NativeEquations(WrappedSystem):
 
 
 def native_equations(compiled: CompiledMechanism, marks: Float[Array, "m"] | None) -> NativeEquations:
-    """Return equations by machine code; `marks` select the independent rows, None if the machine code contains them."""
+    """Return the equations by machine code; `marks` are those from `mark_rows`, None if the machine code needs none."""
     operation, textbook = compiled.plan.evaluation, compiled.textbook
     assert operation is not None  # checked by the caller
     scene = scene_inputs(compiled.equations, textbook.mechanism.at(0.0), operation.code.policy)
@@ -93,7 +93,7 @@ def _pack(
     xp: ModuleType,
     further: Sequence[Any] = (),
 ) -> list[Any]:
-    """Return the inputs with which machine code evaluates equations at a state."""
+    """Return the inputs with which an operation evaluates equations at a state; `further` are its own additional inputs."""
     numbers = [*scene.numbers, *([] if marks is None else [marks]), *scene.thresholds]
     return operation.pack(numbers, xp.stack([t, t]), q, v, scene.settings, scene.rows, xp=xp, further=further)
 
@@ -125,7 +125,7 @@ class ConcreteRates:
 
 
 def equations_for_diffrax(problem: Problem) -> AbstractSystem:
-    """Return the equations of a problem for an integrator of diffrax, by machine code if possible."""
+    """Return the equations of a problem for diffrax to integrate; machine code evaluates them if possible."""
     if problem.compiled.plan.evaluation is None:
         return problem.equations
     marks = mark_rows(problem.compiled, problem.ts[0], problem.q, problem.v, problem.length, problem.rate)

@@ -1,4 +1,4 @@
-"""The end of a run and its cost, from the solver's own statistics."""
+"""The end of a run and its cost, from the output of an integrator."""
 
 from types import ModuleType
 from typing import Any, NamedTuple
@@ -19,12 +19,12 @@ LEAST_ATOL = np.finfo(float).eps
 
 
 class FinishedRun(NamedTuple):
-    """A run as the integrator returns it."""
+    """The output of an integrator, and the facts about the arguments of the run that `outcome` needs."""
 
     raw: IntegratorOutput
     ts: Float[Array, "T"]
     usable: Bool[Array, ""]  # whether its arguments are `usable`
-    closed: Bool[Array, ""]
+    closed: Bool[Array, ""]  # `PreparedRun.is_closed`
     missed: Bool[Array, ""]  # `PreparedRun.has_missed_rows`
 
 
@@ -34,14 +34,14 @@ def increases(ts: Float[Array, "T"]) -> Bool[Array, ""]:
 
 
 def usable(q: Array, v: Array, rtol: Array, atol: Array, drift_tol: Array, dt0: Array | None) -> Bool[Array, ""]:
-    """Return whether numbers are valid for `simulate`, which itself can check only the shapes of traced numbers."""
+    """Return True if these numbers are valid for `simulate`, which can check only the shapes of traced numbers itself."""
     finite = jnp.all(jnp.isfinite(jnp.concatenate([q, v])))
     tolerant = (rtol >= 0) & (atol >= 0) & (rtol + atol >= LEAST_ATOL) & (rtol + atol < jnp.inf) & (drift_tol > 0)
     return finite & tolerant & (True if dt0 is None else (dt0 > 0) & (dt0 < jnp.inf))
 
 
 def failure(status: Any, xp: ModuleType = jnp) -> Any:
-    """Return the `Result` of a run that has ended early, by its `Status`."""
+    """Return the `Result` that belongs to the `Status` of a run that ended before its last time."""
     code = xp.where(status == Status.STEP_LIMIT, Result.step_limit, Result.step_too_small)
     for status_of, result in (
         (Status.NOT_FINITE, Result.not_finite),
@@ -56,7 +56,7 @@ def failure(status: Any, xp: ModuleType = jnp) -> Any:
 
 
 def outcome(run: FinishedRun, xp: ModuleType = jnp) -> tuple[Array, Array]:
-    """Return the `Result` and its time (s): that of the first output with drift, or the last time of the integrator."""
+    """Return the `Result` of a run and its time (s): that of the first output with too much drift, else the integrator's last."""
     raw = run.raw
     code = xp.where(raw.status == Status.DONE, Result.successful, failure(raw.status, xp))
     is_lost = xp.isfinite(raw.lost)
@@ -83,9 +83,13 @@ def status_at_end(equations: AbstractSystem, span: Array, status: Array, t: Arra
 
 
 def counts(raw: IntegratorOutput, projected: bool, outputs: int, xp: ModuleType = jnp) -> dict[str, Int[Array, ""]]:
-    """Return counts of steps, right-hand sides and projections; right-hand sides are -1 if unknown.
+    """Return the numbers of steps, right-hand sides (-1: unknown) and projections of a run, by name, for `Solution.stats`.
 
-    `implicit` counts the accepted steps by an implicit method of machine code.
+    Args:
+        raw: the output of the integrator.
+        projected: whether steps and outputs were projected.
+        outputs: the number of output times.
+        xp: jax.numpy, or NumPy.
     """
     return {
         "steps": raw.tried,

@@ -43,7 +43,10 @@ NO_DRIFT = -1.0  # `drift_tol` of such runs: only their first output is kept
 
 
 class Choices(NamedTuple):
-    """The arguments of `simulate` except the mechanism, its initial state, the times and the events."""
+    """The choices of a run: most arguments of `simulate`, and two remarks, `held` and `kinks`, for `Solution.settings`.
+
+    The mechanism, its analysis and initial state, the output times and the events are given separately.
+    """
 
     rtol: Any  # numbers, which may be traced
     atol: Any
@@ -54,26 +57,26 @@ class Choices(NamedTuple):
     formulation: Formulation | None = None
     solver: "diffrax.AbstractSolver | None" = None
     adjoint: "diffrax.AbstractAdjoint | None" = None
-    meter: "diffrax.AbstractProgressMeter | None" = None
+    meter: "diffrax.AbstractProgressMeter | None" = None  # the progress meter
     max_steps: int = 100_000
     engine: str = "auto"
-    held: str = ""  # pins whose angles are held, as the constraints hold them to second order only
-    stepper: "diffrax.AbstractStepSizeController | None" = None
-    kinks: str = ""  # whether kinks of forces are located, and which are not; empty without any
+    held: str = ""  # names of pins whose angles are held (`with_held_pins`); "": none
+    stepper: "diffrax.AbstractStepSizeController | None" = None  # None: the default controller
+    kinks: str = ""  # a remark: whether kinks of forces are located, and in which forces not; "": there are none
 
     @property
     def of_mechanism(self) -> tuple[Any, ...]:
-        """The arguments of `compile_mechanism` except the mechanism and its analysis."""
+        """The arguments of `compile_mechanism` that follow the mechanism and its analysis, in order."""
         return self.method, self.stabilization, self.formulation, self.solver, self.adjoint, self.meter, self.engine, self.stepper
 
     @property
     def take_diffrax(self) -> bool:
-        """True if diffrax integrates every mechanism with these choices."""
+        """True if diffrax integrates any mechanism with these choices: on request, or if machine code lacks one of them."""
         return self.engine in ("diffrax", "jax") or not has_method(self.solver) or bool(self._of_diffrax)
 
     @property
     def _of_diffrax(self) -> str:
-        """The argument that only diffrax takes; empty without any."""
+        """A phrase for messages that names an argument only diffrax supports, such as "a progress meter"; "" if none is given."""
         if self.stepper is not None:
             return "a step size controller"
         meter = "" if self.meter is None else "a progress meter"
@@ -81,7 +84,7 @@ class Choices(NamedTuple):
 
     @property
     def without_events(self) -> str:
-        """The argument with which a run cannot locate events, kinks and stick-slip; empty without any."""
+        """A phrase for messages: an argument with which runs cannot locate events, kinks or stick-slip; "" if none is given."""
         own = "a stabilization of your own" if isinstance(self.stabilization, Stabilization) else ""
         return self._of_diffrax or own
 
@@ -91,14 +94,17 @@ class Choices(NamedTuple):
         return "jax" if self.engine == "jax" else "diffrax"
 
     def arrays(self) -> "Choices":
-        """Return the choices with arrays of JAX instead of plain numbers, which would be constants of compiled programs."""
+        """Return the choices with JAX arrays instead of plain numbers, which would become constants of compiled programs."""
         dt0 = None if self.dt0 is None else number(self.dt0)
         return self._replace(rtol=number(self.rtol), atol=number(self.atol), drift_tol=number(self.drift_tol), dt0=dt0)
 
     def settings(self, why_not_native: str) -> tuple[tuple[str, str], ...]:
-        """Return pairs of names and values, as strings, of the choices of a run.
+        """Return the settings of a run, for `Solution.settings`: pairs of names and values, all strings.
 
-        `stiff_solver` is the implicit method with which a run by the default method goes on where it is stiff.
+        The setting `stiff_solver` is the implicit method with which a run by the default solver goes on where it is stiff.
+
+        Args:
+            why_not_native: the reason why machine code does not integrate the run; "" if it does.
         """
         return (
             ("method", type(self.method).__name__),
@@ -118,10 +124,11 @@ class Choices(NamedTuple):
 def with_held_pins(
     mechanism: Any, events: Any, analysis: Analysis | None, choices: Choices
 ) -> tuple[Any, Analysis | None, Choices]:
-    """Return the mechanism, analysis and choices of a run with held pins; unchanged if no pin is held.
+    """Return the mechanism, analysis and choices of a run in which pins that cannot turn are held.
 
-    Constraints may prevent a pin from turning to second order only. Its angle is then held to first order, unless an event
-    removes a constraint.
+    Constraints may prevent a pin from turning to second order only: the angle of such a pin is held by a further constraint. The
+    returned analysis is then None, since the mechanism has to be analysed again, and the choices name the pins. All three are
+    returned unchanged if there is no such pin, or if an event removes a constraint.
     """
     if events is not None:
         from udkjax.integrate.events.law.event import listed_events  # other runs do not need the modules of events
@@ -141,7 +148,7 @@ def may_stick(mechanism: RunModel) -> bool:
 
 
 def with_kinks(system: Any, choices: Choices) -> tuple[Choices, bool]:
-    """Return the choices with a remark on jumps and kinks of forces, and whether a run locates them."""
+    """Return the choices with a remark on jumps and kinks of forces, and True if the run locates any of these."""
     if not _may_have_kinks(system):
         return choices, False
     from udkjax.integrate.events.law.kinks import kinks_of  # most runs do not need it
@@ -156,16 +163,16 @@ def _may_have_kinks(system: Any) -> bool:
 
 
 class Beginning(NamedTuple):
-    """The analysis of a model, and its assembled guess, before a run."""
+    """The analysis of a model and the closure of its initial guess, before a run."""
 
     analysis: Analysis | None
     closure: Closure | None  # closure of the initial guess; None if the state is given
     is_open: bool  # whether the closure is known to be open
-    moves: str  # a warning if assembly moves bodies far from the guess; else empty
+    moves: str  # a warning if assembly moves bodies far from the guess; else ""
 
 
 def begin(mechanism: Any, t: Any, analysis: Analysis | None, state: State | None, closure: Closure | None) -> Beginning:
-    """Analyse a model, and assemble its guess at the time t (s), unless these are given."""
+    """Analyse a model, and assemble its initial guess at the time t (s); a given analysis, state or closure is kept instead."""
     analysis = analysis_of(mechanism) if analysis is None else analysis
     Analysis.require_masses(mechanism, "free motions")
     moves = ""
@@ -180,11 +187,11 @@ begin_concrete = cached_by_identity(begin)
 
 
 class PreparedRun(NamedTuple):
-    """A run before its first step."""
+    """A run before its first step, and the facts about its arguments that determine its `Result`."""
 
     problem: Problem
     ts: Float[Array, "T"]  # output times, as given
-    state_shape: tuple[int, ...]
+    state_shape: tuple[int, ...]  # shape of q and v in the solution
     is_usable: Bool[Array, ""]  # whether all numbers are valid for `simulate`
     is_closed: Bool[Array, ""]  # whether the initial state is closed; True for a given state
     has_missed_rows: Bool[Array, ""]  # whether rows left out as redundant are independent in the closed state
@@ -199,11 +206,11 @@ def prepare_run(
     choices: Choices,
     xp: ModuleType = jnp,
 ) -> PreparedRun:
-    """Prepare a run.
+    """Return the problem to integrate, with the facts about its arguments that `outcome` needs.
 
     Args:
         compiled: The mechanism.
-        analysis: The mechanism's `Analysis`; None for a user-defined system.
+        analysis: The `Analysis` of the mechanism; None for a user-defined system.
         ts: Output times (s).
         state: The initial state; None: the state of `closure`.
         closure: The assembled initial guess.
@@ -211,7 +218,8 @@ def prepare_run(
         xp: jax.numpy, or NumPy if all numbers are concrete (`checked` has checked them).
 
     Returns:
-        The run. If it is unusable or open, it gets loose tolerances, so as not to delay other members of a batch.
+        The run. If its numbers are invalid or its initial state is open, it gets loose tolerances, so that it does not delay
+        other members of a batch.
     """
     start = (_concrete_start if xp is np else _start)(compiled, analysis, state, closure)
     rtol, atol, good, given_ts = choices.rtol, choices.atol, xp.asarray(True), ts
@@ -253,13 +261,13 @@ def prepare_run(
 
 
 class RunStart(NamedTuple):
-    """The initial state of a run, and the units that follow from it."""
+    """The initial state of a run, and the units of its tolerances."""
 
     q: Float[Array, "n"]
     v: Float[Array, "n"]
     shape: tuple[int, ...]  # shape of the given coordinates
-    is_closed: Bool[Array, ""]
-    has_missed_rows: Bool[Array, ""]
+    is_closed: Bool[Array, ""]  # as in `PreparedRun`
+    has_missed_rows: Bool[Array, ""]  # as in `PreparedRun`
     length: Any  # unit of `atol` (m); None: coordinates are of order one
     rate: Any  # characteristic rate of the system and the initial velocities (1/s)
 
@@ -289,14 +297,14 @@ def _concrete_start(
 
 
 def jax_adjoint(adjoint: Any) -> Any:
-    """Return an adjoint of diffrax; None for `ForwardMode`, since JAX then differentiates the steps by default."""
+    """Return the adjoint of diffrax for a run; None for `ForwardMode`, since runs have forward derivatives by default."""
     import diffrax
 
     return None if type(adjoint) is diffrax.ForwardMode else adjoint
 
 
 def progress_meter(progress: Any) -> "diffrax.AbstractProgressMeter | None":
-    """Return the progress meter of an argument `progress`."""
+    """Return the progress meter for an argument `progress`: True, False or a meter of diffrax; None if none is to be shown."""
     if progress is False:
         return None
     import diffrax

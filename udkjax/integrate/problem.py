@@ -1,4 +1,4 @@
-"""The input and the output of an integrator: the same for all of them."""
+"""`Problem` and `IntegratorOutput`: the input and the output that all integrators share."""
 
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -16,7 +16,10 @@ from udkjax.transforms.gradients import stop_gradients
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """An initial value problem: q'' = a(t, q, v) of some equations from ts[0] to ts[-1]. Its arrays may be batched."""
+    """An initial value problem: q'' = a(t, q, v) from the state (q, v) at ts[0] to ts[-1], with outputs at all `ts`.
+
+    The arrays may be batched.
+    """
 
     compiled: CompiledMechanism
     ts: Float[Array, "T"]
@@ -33,22 +36,22 @@ class Problem:
     drift_tol: Float[Array, ""]  # violation of Psi, relative to the scales of the rows, beyond which a run has failed
     stepper: Any = None  # a step size controller of diffrax; None: the default
     stabilization: Any = None  # a user-defined `Stabilization`
-    marks: Float[Array, "m"] | None = None  # 1 for each independent row of Psi, else 0; None: machine code contains the marks
-    # Capacity of a record for reverse mode; None: by breakpoints.
+    marks: Float[Array, "m"] | None = None  # marks or weights of the rows of Psi (`mark_rows`); None: machine code needs none
+    # Capacity of the record for reverse mode, in accepted steps; None: a default, larger with more breakpoints.
     points: int | None = field(default=None, metadata={"static": True})
 
     @property
     def equations(self) -> AbstractSystem:
-        """The equations of motion."""
+        """The equations of motion, including those of a formulation that wraps the mechanism's own."""
         return self.compiled.equations
 
     @property
     def textbook(self) -> Any:
-        """The equations, without the formulation that may contain them."""
+        """The equations of the mechanism or user-defined system itself, without a formulation that may wrap them."""
         return self.compiled.textbook
 
     def units(self) -> tuple[Float[Array, "n"], Float[Array, "n"]]:
-        """Return the units of `atol` for coordinates and for velocities."""
+        """Return the units of `atol` for coordinates (`length` or rad; 1 if it is None) and velocities (these times `rate`)."""
         unit = jnp.ones(len(self.q))
         if self.length is not None:
             unit = jnp.where(np.arange(len(self.q)) % 3 == 2, unit, self.length)
@@ -56,21 +59,24 @@ class Problem:
 
 
 class IntegratorOutput(NamedTuple):
-    """A run as an integrator returns it: `status` is one of `native.steps`, from `DONE` on."""
+    """The output of an integrator: states at the output times, and the end of the run.
+
+    `status` is a `Status` of native/module/steps.py: `DONE`, or the reason of a failure.
+    """
 
     q: Float[Array, "T n"]  # NaN at times not reached, or after the first lost output
     v: Float[Array, "T n"]
-    reached: Bool[Array, "T"]
+    reached: Bool[Array, "T"]  # whether the integrator came to each output time
     lost: Float[Array, ""]  # index of the first output where Psi is violated by more than `drift_tol`, or infinite
     status: Int[Array, ""]
     t: Float[Array, ""]  # the time of the end (s)
     y: Float[Array, "2n"]  # the state at t
-    tried: Int[Array, ""]  # steps
-    accepted: Int[Array, ""]
-    evaluations: Int[Array, ""]
-    implicit: Int[Array, ""]  # accepted steps by the implicit method of a default run
+    tried: Int[Array, ""]  # number of steps tried
+    accepted: Int[Array, ""]  # number of steps accepted
+    evaluations: Int[Array, ""]  # number of right-hand sides; -1: unknown
+    implicit: Int[Array, ""]  # number of accepted steps by the implicit method of a default run
 
     @property
     def kept(self) -> Bool[Array, "T"]:
-        """True for outputs that were reached, up to the first lost one."""
+        """A mask of the outputs that were reached, up to the first lost one, which is included."""
         return self.reached & (np.arange(self.reached.shape[-1]) <= self.lost)

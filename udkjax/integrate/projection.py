@@ -21,7 +21,7 @@ checks_instances(Projection)(require_thresholds)
 
 
 def project(equations: AbstractSystem, t: Float[ArrayLike, ""], y: Float[Array, "2n"]) -> Float[Array, "2n"]:
-    """Return (q, v) on the manifold."""
+    """Return the state y = (q, v), projected to the constraint manifold."""
     q, v = jnp.split(y, 2)
     return jnp.concatenate(equations.project(t, q, v))
 
@@ -29,9 +29,9 @@ def project(equations: AbstractSystem, t: Float[ArrayLike, ""], y: Float[Array, 
 def error_after_projection(
     equations: AbstractSystem, t: Float[ArrayLike, ""], q: Array, v: Array, dq: Array, dv: Array
 ) -> TangentPart:
-    """Return the errors dq and dv of a step that ends in q and v.
+    """Return the errors dq and dv of a step, with the part that projection removes multiplied by `NORMAL_ERROR_WEIGHT`.
 
-    The part that projection removes is multiplied by `NORMAL_ERROR_WEIGHT`.
+    The state (q, v) is that at the end of the step, after projection.
     """
     equations, t, q, v, dq, dv = stop_gradients((equations, t, q, v, dq, dv))
     tangent = equations.tangent_part(t, q, v, dq, dv)

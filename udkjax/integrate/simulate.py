@@ -89,15 +89,17 @@ def simulate(
 
     All numbers may be traced: one compilation serves all values of parameters, tolerances, gains and output times, under jit and
     vmap as well. The result has derivatives of any order, forward and reverse; second and higher ones take as long as a hundred
-    runs, and minutes to compile. A violation of Psi above `drift_tol` at an output time ends the solution there; machine
-    code also ends a run at a projected step that leaves more than `drift_tol`, a hundred tolerances and the threshold of pivots,
-    or more than 0.01 (relative to L, or rad). Where rows become dependent, a run that is not projected may lose its energy or
-    change its branch: it ends as `singular` at a step whose violation of Psi exceeds `drift_tol` times the square of the
-    distance of its farther end from such a configuration, relative to the largest of the run. Where rows depend on others along
-    the whole motion, a run whose method finds a larger rank ends as `spurious_rank`. Where a method leaves out rows that are
-    independent, a projected run ends as `missing_rank` as soon as a step with such velocities opens Psi by more than `drift_tol`
-    and the tolerance. Machine code looks after each step, other solvers at outputs or at the end. With an infinite `drift_tol`
-    none of these ends a run.
+    runs, and minutes to compile.
+
+    A violation of Psi above `drift_tol` at an output time ends the solution there. Machine code also ends a run if the violation
+    after the projection of a step exceeds the largest of `drift_tol`, a hundred tolerances and the threshold of pivots, or 0.01
+    (relative to L, or rad). Where rows become dependent, a run that is not projected may lose its energy or change its branch: it
+    ends as `singular` at a step whose violation of Psi exceeds `drift_tol` d^2, where d is the distance of the farther end of the
+    step from such a configuration, relative to the largest distance in the run. Where rows depend on others along the whole
+    motion, a run whose method finds a larger rank ends as `spurious_rank`. Where a method leaves out rows that are independent, a
+    projected run ends as `missing_rank` as soon as a step with such velocities opens Psi by more than `drift_tol` and more than
+    the tolerance. Machine code checks this after each step, other solvers at outputs or at the end. With an infinite `drift_tol`
+    none of these rules ends a run.
 
     Args:
         mechanism: the mechanism, or a `ConstrainedSystem`.
@@ -214,17 +216,17 @@ class _Run(NamedTuple):
     state: State | None
     closure: Closure | None
     choices: Choices
-    is_concrete: bool  # whether all numbers of the mechanism are
-    all_concrete: bool  # whether those of the run are, too
+    is_concrete: bool  # whether all numbers of the mechanism are concrete
+    all_concrete: bool  # whether all other numbers of the run are concrete, too
     sticks: bool  # whether friction may hold a joint
 
     def explained(self, solution: Solution, end: Any) -> Solution:
-        """Return a failed solution with its cause, which the last state (t, (q, v)) shows."""
+        """Return a failed solution with its cause, found from `end`, the last time and state (t, y) of the integrator."""
         return explained(solution, self.system, self.analysis, self.choices.drift_tol, self.choices.solver, end)
 
 
 def _with_events(run: _Run, events: Any, max_events: int | None) -> Solution:
-    """Return the solution with events, kinks and joints that stick located."""
+    """Return the solution of a run that locates events, kinks of forces, and the sticking of joints."""
     if without := run.choices.without_events:
         raise ValueError(f"a run with events needs JAX's own derivatives, its own steps and no progress meter: not {without}")
     if not run.system.has_programs:
@@ -242,7 +244,7 @@ def _with_events(run: _Run, events: Any, max_events: int | None) -> Solution:
 
 
 def _may_move_otherwise(solution: Solution) -> bool:
-    """Return whether events may have left other constraints at the end of a run than the scene has, except by sticking."""
+    """Return True if constraints at the end of a run may differ from those of the scene, apart from locks of sticking joints."""
     changes, found = solution.scene_changes, solution.events
     if changes is None or found is None or not int(found.count):
         return False
@@ -253,7 +255,11 @@ def _may_move_otherwise(solution: Solution) -> bool:
 
 
 def _without_events(run: _Run, throw: bool, located: Solution | None = None) -> Solution:
-    """Return the solution without events, or raise the error: of the run with `located` kinks, where both fail."""
+    """Return the solution of a run that locates no events; if it fails and `throw` is set, raise its error.
+
+    `located` is the failed solution of the same run with its kinks located, if there was such a run. If both fail, `located` is
+    returned, or its error raised; else its last time becomes `Solution.unlocated`.
+    """
     solution, missed, end, code = _integrate(run)
     if throw and not run.is_concrete and run.mechanism.has_bodies and _has_failed(code):
         given = solution if located is None else located, run.mechanism, run.analysis, run.choices.drift_tol, end
@@ -272,21 +278,21 @@ def _without_events(run: _Run, throw: bool, located: Solution | None = None) -> 
 
 
 def _has_failed(code: Any) -> bool:
-    """Return True if `code` is that of a single run with concrete numbers that has not reached its end."""
+    """Return True if `code` is the concrete `Result` of a single run that has not reached its end; False if it is traced."""
     return not isinstance(code, Tracer) and int(code) not in SUCCESSES
 
 
 def _required(solution: Solution, throw: bool) -> Solution:
-    """Return a solution, or raise the error of a failed run."""
+    """Return a solution; if it is that of a failed run and `throw` is set, raise `SimulationError`."""
     if throw and _has_failed(solution.code):
         raise SimulationError(solution.cause, solution)
     return solution
 
 
 def _integrate(run: _Run) -> tuple[Solution, Any, Any, Any]:
-    """Return the solution, whether rows left out as redundant are independent, the last state (t, (q, v)), and the `Result`.
+    """Return the solution, whether rows left out as redundant are independent, the last time and state (t, y), and the `Result`.
 
-    The result is a NumPy number if machine code is called by NumPy: reading that of the solution from a graphics card takes long.
+    The `Result` is a NumPy number if machine code is called by NumPy: reading it from a solution on a graphics card takes long.
     With concrete numbers NumPy calls machine code directly; everything else is traced.
     """
     _, system, analysis, ts, state, closure, choices, _, all_concrete, _ = run
@@ -327,7 +333,7 @@ _compiled, _deferred = on_host(eqx.filter_jit(_simulate)), deferred(_simulate)
 def _finish(
     run: PreparedRun, raw: IntegratorOutput, bodies: tuple[str, ...], choices: Choices, xp: ModuleType = jnp
 ) -> tuple[Solution, Any, Any, Any]:
-    """Return the results of `_run`, from the output of the integrator."""
+    """Return the results of `_integrate`, from the output of the integrator."""
     problem, ts = run.problem, run.ts
     ending = FinishedRun(raw, ts, run.is_usable, run.is_closed, run.has_missed_rows)
     code, time = outcome(ending if xp is np else stop_gradients(ending), xp)

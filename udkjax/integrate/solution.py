@@ -102,7 +102,7 @@ _ORDER = (
 
 
 class SimulationError(RuntimeError):
-    """A simulation did not reach its end.
+    """The error of a simulation that did not reach its end.
 
     Attributes:
         message: the cause, and the cure.
@@ -131,10 +131,10 @@ class Solution(PrintsTable):
         bodies: the names of the bodies, in the order of q and v.
         unlocated: time (s) from which jumps and kinks of forces are not located, so that derivatives do not pass through them;
             infinite if all are located, None if there are none.
-        sticking: for each joint with set-valued friction, whether it sticks at the output times, or is held at rest by drivers;
-            None without any.
-        scene_changes: the constraints that events release, add or hold, at the output times; None if no event changes any. By
-            these, reactions, accelerations and other quantities of this solution are those of the constraints that hold.
+        sticking: by joint with set-valued friction, a mask of the output times at which the joint sticks, or drivers hold it at
+            rest; None if there is no such joint.
+        scene_changes: the constraints that events release, add or hold, at the output times; None if no event changes any.
+            Functions of a solution, such as `reactions` and `accelerations`, use the constraints that hold at each time.
     """
 
     ts: Float[Array, "T"]
@@ -160,9 +160,10 @@ class Solution(PrintsTable):
 
     @property
     def holds(self) -> dict[str, Bool[Array, "T"]]:
-        """Masks of the output times at which constraints that events release or add, and contacts that may rest, hold.
+        """Masks of the output times at which constraints hold, by name: those that events release or add, and contacts.
 
-        The contact of an event "floor" is "floor.contact"; after an event, its time is the first at which changes show.
+        The contact of an event "floor" has the name "floor.contact", and holds while it rests.
+        An output at the time of an event is after the event.
         """
         return {} if self.scene_changes is None else self.scene_changes.by_name
 
@@ -206,7 +207,7 @@ class Solution(PrintsTable):
         return PrintedTable("simulation", list(rows.items()))
 
     def frame(self, body: str) -> Frame:
-        """Return the frame of a body, each of its numbers (T,)."""
+        """Return the frame of a body over time: each of its numbers is an array (T,)."""
         return frame_over_time(self.bodies, self.q, self.v, body)
 
     def path(self, body: str, point: Numbers = (0.0, 0.0)) -> Float[Array, "T 2"]:
@@ -262,7 +263,7 @@ class Solution(PrintsTable):
 
 
 def format_work(stats: Mapping[str, ArrayLike]) -> str:
-    """Return the counts of a run as text; a count of -1 is unknown."""
+    """Return the counts of a run (`Solution.stats`) as text, without those that are -1, unknown."""
     words = {name: name.replace("_", " ") for name in stats} | {"right_hand_sides": "right-hand sides"}
     counts = {name: int(np.asarray(count)) for name, count in stats.items() if name != "accepted"}
     if not counts.get("implicit", 1):
@@ -271,7 +272,7 @@ def format_work(stats: Mapping[str, ArrayLike]) -> str:
 
 
 def scene_text(mechanism: Any) -> str:
-    """Return a mechanism as the text of a scene file, or the reason why this is impossible."""
+    """Return a mechanism as the text of a scene file; if this is impossible, a comment with the reason."""
     from udkjax.scene.files import dumps
     from udkjax.scene.tables.checks import SceneError
 
@@ -282,7 +283,7 @@ def scene_text(mechanism: Any) -> str:
 
 
 def versions() -> dict[str, str]:
-    """Return the versions that a result depends on."""
+    """Return the versions of Python and of the packages on which results depend, by name."""
     from importlib.metadata import PackageNotFoundError, version
 
     result = {"python": sys.version.split()[0]}

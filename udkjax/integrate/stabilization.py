@@ -42,7 +42,7 @@ class ConstraintState(eqx.Module):
 
     @property
     def psi_dot(self) -> Float[Array, "k"]:
-        """Psi_dot, and after it phi of a `ConstrainedSystem`: the residuals of the velocities."""
+        """Psi_dot, followed by phi of a `ConstrainedSystem`: the residuals of the constraints on velocities."""
         return self.equations.violation(self.t, self.q, self.v)[1]
 
     @property
@@ -56,7 +56,7 @@ class ConstraintState(eqx.Module):
         return self.equations.mass(self.t, self.q, self.v)
 
     def moved(self, q: Vector, v: Vector) -> "ConstraintState":
-        """Return another state at the same time."""
+        """Return the same step with another state, (q, v)."""
         return eqx.tree_at(lambda s: (s.q, s.v), self, (q, v))
 
     def change_of_positions(self, residual: Float[Array, "m"]) -> Vector:
@@ -64,7 +64,7 @@ class ConstraintState(eqx.Module):
         return self.equations.least_change(self.t, self.q, self.v, residual, len(self.psi))
 
     def change_of_velocities(self, residual: Float[Array, "k"]) -> Vector:
-        """Return the least change w (n,) in the metric of M with A w = residual, A = Psi_q, and after it phi_v."""
+        """Return the least change w (n,) in the metric of M with A w = residual; A has the rows of Psi_q, then those of phi_v."""
         return self.equations.least_change(self.t, self.q, self.v, residual, len(self.psi_dot))
 
 
@@ -107,31 +107,31 @@ checks_instances(Stabilization)(require_thresholds)
 
 
 def rates(stabilization: Stabilization, t: Any, q: Any, v: Any, h: Any, a: Any, equations: Any) -> tuple[Vector, Vector]:
-    """Return q' and v' at a state of equations within a step of length h."""
+    """Return q' and v' by a stabilization, at a state of `equations` with accelerations a, within a step of length h."""
     return stabilization.rates(ConstraintState(t, q, v, h, equations), v, a)
 
 
 def end_of_step(stabilization: Stabilization, t: Any, q: Any, v: Any, h: Any, a: Any, equations: Any) -> tuple[Vector, Vector]:
-    """Return q and v after a step of length h that has led to a state of equations."""
+    """Return q and v by a stabilization, after a step of length h has led to a state of `equations`; `a` is not used."""
     del a
     return stabilization.end_of_step(ConstraintState(t, q, v, h, equations))
 
 
 def overridden(stabilization: Stabilization) -> dict[str, Callable[..., tuple[Vector, Vector]]]:
-    """Return the methods of a stabilization that are not those of its base, as functions of numbers, by name."""
+    """Return the methods that a stabilization overrides, by name, as the functions `rates` and `end_of_step` of this module."""
     methods = {"rates": rates, "end_of_step": end_of_step}
     return {x: f for x, f in methods.items() if getattr(type(stabilization), x) is not getattr(Stabilization, x)}
 
 
 class StabilizedEquations(WrappedSystem):
-    """Equations whose rates a stabilization changes, in a step of length h."""
+    """Equations of motion within a step of length h, with the rates that a stabilization returns."""
 
     equations: Any
     stabilization: Stabilization
     h: Float[Array, ""]
 
     def at(self, t: Time, q: Vector, v: Vector) -> ConstraintState:
-        """Return a state with its constraints."""
+        """Return a state within the step as a `ConstraintState`."""
         return ConstraintState(jnp.asarray(t), q, v, self.h, self.equations)
 
     def accelerations(self, t: Time, q: Vector, v: Vector) -> Vector:

@@ -104,7 +104,7 @@ def step(
 
 
 def _checked_inputs(inputs: Any) -> dict[str, Any]:
-    """Return the inputs of an interval; raise an error for anything that is not held constant."""
+    """Return the inputs of an interval as a dict; raise `ArgumentTypeError` if they are no mapping, or one varies as a `Held`."""
     if not inputs:
         return {}
     if not isinstance(inputs, Mapping):
@@ -142,9 +142,9 @@ _advance_at_once = deferred(_advance)
 
 
 class _Steps:
-    """The intervals of a concrete mechanism: its numbers as one array, and its programs for the forms of inputs met so far.
+    """Programs that integrate one interval of a concrete mechanism, one for each form of inputs and states met so far.
 
-    A program takes two arrays, since each costs microseconds in a call.
+    A program takes two arrays, the numbers of the mechanism and everything else, since each array costs microseconds in a call.
     """
 
     def __init__(self, mechanism: Any, analysis: Analysis | None):
@@ -158,7 +158,10 @@ class _Steps:
     def program(
         self, mechanism: Any, values: Mapping[str, Any], shape: tuple[int, ...], max_steps: int, engine: str
     ) -> Callable[..., tuple[Array, Array]]:
-        """Return the program of an interval for states and inputs of these shapes; inputs that do not fit raise an error."""
+        """Return a function (state, values, others) -> (q, v) for states and inputs of these shapes.
+
+        Inputs that do not fit the mechanism raise an error.
+        """
         shapes = tuple((name, np.shape(x)) for name, x in values.items())
         key = shapes, shape, max_steps, engine
         if key not in self._programs:
@@ -176,7 +179,7 @@ class _Steps:
 
 @cached_by_identity
 def _steps_of(mechanism: Any, analysis: Analysis | None, *names: str) -> _Steps:
-    """Return the intervals of a mechanism with inputs of these names, cached for all of its steps."""
+    """Return the programs of a mechanism with inputs of these names; all steps of the mechanism share one object."""
     return _Steps(mechanism.without_origin_beside(names), analysis or analysis_of(mechanism))
 
 
@@ -189,7 +192,16 @@ def _program(
     max_steps: int,
     engine: str,
 ) -> Callable[..., tuple[Array, Array]]:
-    """Return the interval as a program for all mechanisms with one structure."""
+    """Return the program (numbers, given) -> (q, v) of an interval, for all mechanisms of one structure.
+
+    Args:
+        form: the tree structure of the mechanism and its analysis.
+        kinds: the shapes and types of their leaves, which are concatenated in `numbers`.
+        inputs: the names and shapes of the inputs.
+        shape: the shape of q and v.
+        max_steps: the largest number of steps tried.
+        engine: as in `simulate`.
+    """
 
     def run(numbers: Array, given: Array) -> tuple[Array, Array]:
         shapes = [shape, shape, *4 * [()], *(x for _, x in inputs)]
@@ -205,6 +217,6 @@ def _program(
 
 
 def split_array(array: Array, shapes: Sequence[tuple[int, ...]]) -> list[Array]:
-    """Return parts of a vector, one after another, in these shapes."""
+    """Return consecutive parts of a vector as arrays of these shapes."""
     ends = np.cumsum([math.prod(shape) for shape in shapes], dtype=int)
     return [x.reshape(shape) for x, shape in zip(jnp.split(array, ends)[:-1], shapes, strict=True)]

@@ -27,7 +27,7 @@ from udkjax.transforms.traced_numbers import Mask, TreeOfNumbers, select, split_
 
 
 def run_of_times(run: Callable[[Problem], IntegratorOutput], problem: Problem) -> IntegratorOutput:
-    """Return `run(problem)` with derivatives of q and v along `problem.ts`, which the function `run` does not have."""
+    """Return `run(problem)`, where q and v also have derivatives with respect to `problem.ts`, which those of `run` lack."""
     ts = stop_gradients(problem.ts)
     move = partial(moved, replace(problem, ts=ts))
     q, v = move(problem.ts[0], problem.q, problem.v, ts[0] - problem.ts[0])
@@ -39,7 +39,7 @@ def run_of_times(run: Callable[[Problem], IntegratorOutput], problem: Problem) -
 def moved(
     problem: Problem, t: Float[Array, ""], q: Float[Array, "n"], v: Float[Array, "n"], s: Float[Array, ""]
 ) -> tuple[Float[Array, "n"], Float[Array, "n"]]:
-    """Return a state at t after a time s = 0: its value, with the derivatives of the motion."""
+    """Return the state (q, v) at t, moved along the motion for a time s that is zero: unchanged, but with derivatives by s."""
     problem_of, numbers = split_numbers(problem)
     # A state is batched wherever its changes are, since JAX requires that derivative rules return values with unchanged batching.
     zero = sum(map(zero_of, (s, t, *numbers)))
@@ -48,7 +48,7 @@ def moved(
 
 
 class Rates(eqx.Module):
-    """The rates x' of numbers x."""
+    """A function that returns the rates x' of a list of arrays x."""
 
     @abstractmethod
     def __call__(self, x: list[Array]) -> list[Array]:
@@ -56,7 +56,7 @@ class Rates(eqx.Module):
 
 
 class RatesOfState(Rates):
-    """The rates of time, q and v, and of the numbers of a problem, which are constant."""
+    """The rates of x = [t, q, v, *numbers]: [1, q', v', *zeros], since the numbers of a problem are constant."""
 
     problem: TreeOfNumbers
 
@@ -67,7 +67,7 @@ class RatesOfState(Rates):
 
 
 class RatesOfChange(Rates):
-    """The rates of x, followed by those of its changes."""
+    """The rates of [*x, *dx], where dx are small changes of x: with x' = r(x) they are [*r(x), *(dr/dx dx)]."""
 
     rates: Rates
 
@@ -78,7 +78,7 @@ class RatesOfChange(Rates):
 
 
 class StateAfter(DifferentiableFunction):
-    """q and v after a time s = 0, as a function of s, t, q, v and the numbers of a problem."""
+    """The state [q, v] after a time s that is zero, as a function of [s, t, q, v, *numbers of a problem]."""
 
     rates: RatesOfState
 

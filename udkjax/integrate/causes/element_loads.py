@@ -18,7 +18,7 @@ TimedState = tuple[float, np.ndarray, np.ndarray]  # t (s), q and v (n,)
 
 
 class ElementLoads(NamedTuple):
-    """Loads of the force elements at states, and the fastest rates (1/s) of their damping and stiffness."""
+    """Sizes and jumps of the loads of force elements at states, and the fastest rates (1/s) of their damping and stiffness."""
 
     names: tuple[str, ...]
     size: np.ndarray  # (states, elements): largest acceleration of the element's bodies, in L / s^2 and rad / s^2
@@ -30,14 +30,14 @@ class ElementLoads(NamedTuple):
 def element_loads(
     mechanism: Mechanism, length: float, states: Sequence[TimedState], mobility: np.ndarray | None = None
 ) -> ElementLoads:
-    """Evaluate the loads of each force element at several states.
+    """Return measures of the loads of each force element at several states.
 
     Args:
         mechanism: the mechanism.
         length: the characteristic length (m).
         states: the states.
-        mobility: the projection onto the motions that the constraints allow, in the mass metric (n, n): rates are those of
-            these motions. None: those of each element's bodies alone.
+        mobility: the projection (n, n) onto the motions that the constraints allow, in the mass metric: the rates of damping and
+            stiffness are those of these motions. None: the bodies of each element move freely.
     """
     names, count = mechanism.force_names, len(mechanism.forces)
     ts, qs, vs = (np.stack([np.asarray(s[k], float) for s in states]) for k in range(3))
@@ -66,7 +66,11 @@ def element_loads(
 
 
 def _evaluate(mechanism: Mechanism, ts: np.ndarray, qs: np.ndarray, vs: np.ndarray) -> list:
-    """Return kinds of elements with loads (states, elements, 3k) and derivatives with respect to q and v of the moving bodies."""
+    """Return pairs of a kind of elements, of the same structure and with k moving bodies each, and values at all states.
+
+    The values are the loads (states, elements, 3k), and their derivatives with respect to q and to v of these bodies, each
+    (states, elements, 3k, 3k).
+    """
     kinds: list = []
 
     def at(t: Array, q: Array, v: Array) -> list:

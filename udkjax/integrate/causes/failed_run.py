@@ -1,4 +1,4 @@
-"""Data of a failed run, from which its cause is found."""
+"""The data of a failed run, from which its cause is found."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -16,17 +16,17 @@ from udkjax.scene.mechanism import Mechanism
 
 @dataclass(frozen=True, eq=False)
 class FailedRun:
-    """A failed single run of a mechanism of concrete numbers."""
+    """The data of a failed run of one mechanism (not a batch) with concrete numbers."""
 
     mechanism: Mechanism
     analysis: Analysis
     result: Result
-    time: float  # (s)
-    ts: np.ndarray  # (T,)
+    time: float  # end of the run (s)
+    ts: np.ndarray  # output times (T,)
     q: np.ndarray  # (T, n); NaN at times that were not reached
-    v: np.ndarray
+    v: np.ndarray  # (T, n), likewise NaN there
     end: tuple[float, np.ndarray, np.ndarray] | None  # the last state of the integrator, if available
-    steps: int
+    steps: int  # number of steps tried
     rtol: float
     atol: float
     drift_tol: float
@@ -42,7 +42,7 @@ class FailedRun:
 
     @cached_property
     def rows(self) -> PositionRows:
-        """Psi and D of the mechanism."""
+        """The rows of the mechanism, which evaluate Psi and D at positions."""
         return kinematic_rows(self.mechanism)
 
     @property
@@ -52,7 +52,7 @@ class FailedRun:
 
     @cached_property
     def states(self) -> list[tuple[float, np.ndarray, np.ndarray]]:
-        """The usable states (t, q, v), latest first: that of the integrator, then the outputs before the failure."""
+        """The usable states (t, q, v), latest first: the last one of the integrator, then the outputs before the failure."""
         finite = np.isfinite(self.q).all(1) & np.isfinite(self.v).all(1)
         good = [k for k in range(len(self.ts)) if finite[k] and (self.ts[k] < self.time or not self._has_drifted(k))]
         listed = [(float(self.ts[k]), self.q[k], self.v[k]) for k in reversed(good)]
@@ -61,7 +61,7 @@ class FailedRun:
         return [self.end, *listed]
 
     def _has_drifted(self, k: int) -> bool:
-        """Return True if Psi at output k exceeds the tolerance of drift, or the run ended by drift before this output."""
+        """Return True if the run ended by drift, and output k is later than its end or violates Psi by more than `drift_tol`."""
         if self.result != Result.drift or self.ts[k] > self.time:
             return self.result == Result.drift
         return not np.max(np.abs(self.psi(self.ts[k], self.q[k])) / self.row_scales, initial=0.0) <= self.drift_tol
@@ -75,12 +75,12 @@ class FailedRun:
         return np.asarray(constraints.psi_dot(self.mechanism.without_origin, t, q, v))
 
     def decomposed(self, t: float, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the left singular vectors and the singular values of D, with rows of length one."""
+        """Return the left singular vectors and the singular values of D with rows of length one; NaN if D is not finite."""
         D = self.rows.dense(self.rows.at(t, q)[2])
         return np.linalg.svd(D, full_matrices=False)[:2] if np.all(np.isfinite(D)) else (D, np.full(len(D), np.nan))
 
     def mobility(self, t: float, q: np.ndarray) -> np.ndarray | None:
-        """Return the projection onto the motions that the constraints allow, in the mass metric; None if not finite."""
+        """Return the projection (n, n) onto the motions that the constraints allow, in the mass metric; None for a D with NaN."""
         D = self.rows.dense(self.rows.at(t, q)[2]) if self.rows.count else np.zeros((0, len(q)))
         if not np.all(np.isfinite(D)):
             return None

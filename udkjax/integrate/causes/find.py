@@ -36,7 +36,7 @@ class FoundCause:
 
     @classmethod
     def of(cls, solution: Solution, text: str) -> "FoundCause":
-        """Return a cause that is known already."""
+        """Return the cause `text`, already known, of the failed run of a solution."""
         cause = cls(None, text)
         cause._key = int(solution.code), float(solution.time)
         return cause
@@ -63,7 +63,7 @@ class FoundCause:
 
 
 def find_cause(run: FailedRun) -> str | None:
-    """Return the cause of a failed run; None if nothing beyond its result is found."""
+    """Return the cause of a failed run in words; None if no cause is found that says more than its `Result`."""
     not_finite = " and ".join(
         text for text in (name_not_finite(run.mechanism, run.q[0]), name_not_finite(run.mechanism, run.v[0], RATES)) if text
     )
@@ -89,13 +89,13 @@ def find_cause(run: FailedRun) -> str | None:
 
 
 def cause_of_standstill(mechanism: Mechanism, span: float, state: tuple[float, Any, Any], time: float) -> str:
-    """Return the demands of drivers that stopped a run elsewhere, as on a page; empty if drivers did not stop it.
+    """Describe the demands of drivers that stopped a run outside of Python, as on a web page; "" if drivers did not stop it.
 
     Args:
         mechanism: mechanism of concrete numbers.
         span: duration of the run (s).
         state: a state (t, q, v) of the run before its end.
-        time: when it ended (s).
+        time: the time of its end (s).
     """
     t, q, v = state[0], *(np.ravel(np.asarray(x, float)) for x in state[1:])
     run = FailedRun(
@@ -207,18 +207,18 @@ def _explain_many_steps(run: FailedRun) -> str | None:
 
 
 def _reach_at_end(run: FailedRun) -> str:
-    """Describe the demands of drivers if the run ended where the mechanism cannot follow them."""
+    """Describe the demands of drivers if the run ended where the mechanism cannot follow them, else return ""."""
     t = run.states[0][0]
     return explain_reach(run, _shortly_after(run, t)) if t < run.ts[-1] else ""
 
 
 def _shortly_after(run: FailedRun, t: float) -> float:
-    """Return a time at which a demand that stopped the run at t is clearly out of reach."""
+    """Return a time (s) at which a demand of a driver that stopped the run at t is clearly out of reach."""
     return min(float(run.ts[-1]), t + NEAR_REACH * float(run.ts[-1] - run.ts[0]))
 
 
 def _near_singular(run: FailedRun) -> str:
-    """Describe the singular configuration near which the run ended, with its joints."""
+    """Describe the singular configuration near which the run ended, with its joints; "" if there is none."""
     place = _nearest_singular(run)
     if place is None or not place[1] < SINGULAR:
         return ""
@@ -226,7 +226,10 @@ def _near_singular(run: FailedRun) -> str:
 
 
 def _nearest_singular(run: FailedRun) -> tuple[str, float] | None:
-    """Return the joints whose rows are closest to dependence at the end, and the smallest singular value over the largest."""
+    """Return the joints whose rows are closest to dependence at the end, and the smallest singular value over the largest.
+
+    Return None if the rank of the mechanism is unknown or zero.
+    """
     t, q, _ = run.states[0]
     rank = run.analysis.rank
     if rank is None or not rank:
@@ -246,15 +249,18 @@ def _rank(run: FailedRun) -> int:
 def explained(
     solution: Solution, mechanism: Any, analysis: Analysis | None, drift_tol: Any, solver: Any, end: Any = None
 ) -> Solution:
-    """Return the solution of a failed single run, with its cause: found on demand, or at once by the functions of a system.
+    """Return the solution of a failed single run with its cause.
+
+    The cause of a mechanism's run is searched for when it is first read. The cause of a user-defined system's run is found here,
+    if the values of its functions show one.
 
     Args:
         solution: the solution, of concrete numbers.
         mechanism: the mechanism, or the traced system.
-        analysis: the `Analysis` of the mechanism; None of a system.
+        analysis: the `Analysis` of the mechanism; None for a system.
         drift_tol: the `drift_tol` of the run.
         solver: the run's solver; None: the default.
-        end: the last state (t, (q, v)) of the integrator, if available.
+        end: the last time and state (t, y) of the integrator, y = (q, v), if available.
     """
     if analysis is None:  # of a system
         text = cause_in_functions(solution, mechanism, end)

@@ -1,4 +1,4 @@
-"""Causes in the elements of a mechanism: laws that are not finite, and forces that jump, grow without bound or are stiff."""
+"""Causes of failed runs in elements: laws that are not finite, and forces that jump, grow without bound or are stiff."""
 
 import numpy as np
 
@@ -16,7 +16,7 @@ STIFF = 0.1  # least rate times step; explicit methods of any order lose stabili
 
 
 def explain_undefined_law(run: FailedRun) -> str:
-    """Name the elements with non-finite numbers at the end of the run or shortly after."""
+    """Name the joints, drivers and forces whose laws are not finite at the end of the run or shortly after; "" if all are."""
     t, q, v = run.states[0]
     span = float(run.ts[-1] - run.ts[0])
     states = [(t + share * span, q + share * span * v, v) for share in NOT_FINITE_TIMES]
@@ -33,7 +33,7 @@ def explain_undefined_law(run: FailedRun) -> str:
 
 
 def explain_violent_force(run: FailedRun) -> str:
-    """Name the force element that jumps at the end of the run, or has grown without bound."""
+    """Describe the force element that jumps at the end of the run, or has grown without bound; "" if there is none."""
     t, q, v = run.states[0]
     span, speed = float(run.ts[-1] - run.ts[0]), float(run.analysis.scales.size(v, np))
     scales = run.analysis.scales
@@ -74,7 +74,7 @@ def _jumps(run: FailedRun, first: TimedState, last: TimedState) -> np.ndarray:
 
 
 def explain_stiff_force(run: FailedRun) -> str:
-    """Name the force element that keeps the steps of an explicit solver short."""
+    """Describe the force element that keeps the steps of an explicit solver short; "" if there is none."""
     t, q, v = run.states[0]
     if not run.is_explicit or run.steps < 1 or not t > run.ts[0]:
         return ""

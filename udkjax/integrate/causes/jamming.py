@@ -1,4 +1,4 @@
-"""Friction that admits no motion: the joints whose friction, as it depends on their own load, jams a mechanism."""
+"""Friction that admits no motion: joints jam a mechanism if their friction grows with the loads that it causes itself."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -16,7 +16,7 @@ JAMMING_TIMES = 0.0, 1e-9, 1e-6, 1e-4  # times after the end of a run, as fracti
 
 
 def explain_jamming(run: FailedRun) -> str:
-    """Name the joints that jam at the end of a run, or just ahead; empty if friction admits a motion there."""
+    """Name the joints that jam at the end of a run or shortly after; "" if friction admits a motion there."""
     mechanism = run.mechanism.without_origin
     joints = equations_of(mechanism, analysis=run.analysis).rubbing_joints
     if not joints or not run.states:
@@ -50,9 +50,9 @@ def _jams(run: FailedRun, mechanism: Mechanism, state: tuple[float, np.ndarray, 
 
 
 def _sliding(mechanism: Mechanism, joint: str | None = None) -> Mechanism:
-    """Return the mechanism with friction that depends on loads alone, of all joints or of one.
+    """Return the mechanism with only that part of its friction which depends on loads: in all joints, or in `joint` alone.
 
-    Joints slide, so the smooth law serves for the set-valued one, whose decisions would take long.
+    The smooth law replaces the set-valued one, since joints slide, and decisions whether they stick would take long.
     """
     forces = {}
     for name, force in mechanism.forces.items():

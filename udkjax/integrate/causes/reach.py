@@ -25,7 +25,7 @@ SAME_BRANCH = 1.0  # in rad and characteristic lengths: larger changes lead to a
 
 
 class Reach(NamedTuple):
-    """The last position that closes, and the constraints with impossible demands."""
+    """The last position at which the constraints close, and those constraints whose demands beyond it are impossible."""
 
     t: float  # (s)
     q: np.ndarray  # (n,)
@@ -33,7 +33,7 @@ class Reach(NamedTuple):
 
 
 def explain_reach(run: FailedRun, until: float) -> str:
-    """Describe the demands of drivers, up to a time (s), that the mechanism cannot meet; empty if it can."""
+    """Describe the demands of drivers up to the time `until` (s) that the mechanism cannot meet; "" if it can meet all."""
     mechanism = run.mechanism
     if not mechanism.drivers:
         return ""
@@ -57,7 +57,10 @@ def explain_reach(run: FailedRun, until: float) -> str:
 
 
 def _find_reach(run: FailedRun, until: float) -> Reach | None:
-    """Return the time and position where the constraints stop closing; None if they close everywhere or nowhere."""
+    """Return the last position at which the constraints close before the time `until` (s).
+
+    Return None if they close up to this time, or at none of the last states of the run.
+    """
     rows, size = run.rows, run.rows.scales.size
     first = next((p for p in (rows.close(t, q) for t, q, _ in run.states[:STATES_TRIED] if t < until) if p is not None), None)
     if first is None:
@@ -93,7 +96,7 @@ def _find_reach(run: FailedRun, until: float) -> Reach | None:
 
 
 def _demanding(run: FailedRun, t: float, q: np.ndarray, until: float) -> frozenset[str]:
-    """Return the constraints whose demands after a time are impossible: outside the range of D."""
+    """Return the names of the constraints whose demands at the time `until`, seen from q at t, are outside the range of D."""
     rows = run.rows
     psi, length, D = rows.at(t, q)
     u, sigma, _ = np.linalg.svd(rows.dense(D))
@@ -139,7 +142,7 @@ def dead_point(mechanism: Mechanism, found: Reach, drivers: list[str]) -> str:
 
 
 def _value(mechanism: Mechanism, name: str, t: float) -> str:
-    """Return the value of a driver at a time (s) as text: in the count of the drawing if there is one, else in rad or m."""
+    """Return the value of a driver at a time (s) as text: as its drawing counts it if there is one, else in rad or m."""
     driver = mechanism.drivers[name]
     value = float(driver.motion(t))
     if mechanism.drawing is not None:

@@ -15,7 +15,7 @@ SINGULAR = 1e-12  # M is singular if its smallest eigenvalue is at most this, re
 
 
 def cause_in_functions(solution: Solution, system: Any, end: tuple[Any, Any]) -> str:
-    """Return the cause of a failed run that the functions of a system show at the last state of the integrator, if any."""
+    """Return the cause of a failed run that the functions of a system show at `end`, the last (t, y); "" if they show none."""
     t, (q, v) = np.asarray(end[0]), np.split(np.asarray(end[1]), 2)
     with jax.ensure_compile_time_eval():
         text = cause_of(_values(system, t, q, v))
@@ -28,7 +28,7 @@ def cause_in_functions(solution: Solution, system: Any, end: tuple[Any, Any]) ->
 
 @deferred
 def _values(system: Any, t: Any, q: Any, v: Any) -> dict[str, Array]:
-    """Return the values of all functions of a system at a state."""
+    """Return the values of all functions of a system at a state, by name."""
     values = {"mass": system.mass(q)}
     values |= {name: function(t, q) for name in ("constraint", "potential") if (function := getattr(system, name)) is not None}
     names = "force", "velocity_constraint"
@@ -41,14 +41,14 @@ def _psi(system: Any, t: Any, q: Any) -> Array:
 
 
 def cause_of_opening(psi: np.ndarray) -> str:
-    """Return which rows of the constraint of a system an initial state violates most, with the cure."""
+    """Name the rows of the constraint of a system that an initial state violates most, with the cure; "" if all psi are zero."""
     largest = [k for k in np.argsort(-np.abs(psi))[:MOST_ROWS].tolist() if psi[k]]
     found = ", ".join(f"constraint[{k}] is {psi[k]:.3g}" for k in largest)
     return f"the initial state is open: {found}; give a `State` at which constraints are zero" if found else ""
 
 
 def cause_of(values: Mapping[str, ArrayLike]) -> str:
-    """Return the cause that the values of the functions of a system at a state show; empty if they show none."""
+    """Return the cause of failure that the values of the functions of a system at a state show; "" if they show none."""
     broken = [name for name, value in values.items() if not np.all(np.isfinite(np.asarray(value)))]
     if broken:
         return f"{' and '.join(broken)} of the system {'is' if len(broken) == 1 else 'are'} not finite"

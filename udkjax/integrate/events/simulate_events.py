@@ -56,15 +56,15 @@ UNRESOLVED = "conditions of events vary too quickly for the shortest window, 1e-
 
 
 class Given(NamedTuple):
-    """The arguments of a run: the phases of a mechanism, the events, the initial state and the choices."""
+    """The arguments of a run with events: the phases of its mechanism, the events, the initial state and the choices."""
 
     phases: Phases
     events: tuple[Event, ...]  # the user's events, then the kinks of forces
     ts: Float[Array, "T"]
     state: State | None
-    closure: Closure | None  # instead of the state
+    closure: Closure | None  # the assembled guess, instead of a state
     choices: Choices
-    max_events: int
+    max_events: int  # largest number of listed events
     conditions: Conditions | None  # conditions of all events, for machine code; None if it cannot run them
     moves: bool  # whether times may have derivatives, which only runs without events of the user have
 
@@ -84,8 +84,8 @@ def simulate_events(
 
     Args:
         mechanism: the scene, or a system of traced functions.
-        events: one event or several, ready-made ones among them; None: only the kinks of forces.
-        analysis: its `Analysis`; None for a system.
+        events: the events, as for `simulate`; None: only kinks of forces and joints that stick are located.
+        analysis: the `Analysis` of the mechanism; None for a system.
         ts: the output times (s).
         state: the initial state; None: the state of `closure`.
         closure: the assembled initial guess.
@@ -164,7 +164,10 @@ def _expand(mechanism: Any, events: Sequence[ExpandsToEvents] | None, analysis: 
 
 
 def _run(given: Given) -> tuple[EventRun, tuple[str, ...]]:
-    """Run; return the result, and for each mechanism why machine code cannot integrate it."""
+    """Run a mechanism with events, and return the result.
+
+    Also return, for each mechanism of the phases, the reason why machine code cannot integrate it; "" if it can.
+    """
     phases, events, ts, state, closure, choices, max_events, conditions, moves = given
     compiled = [compile_mechanism(m, a, *choices.of_mechanism) for m, a in zip(phases.mechanisms, phases.analyses, strict=True)]
     run = prepare_run(compiled[0], phases.analyses[SCENE], ts, state, closure, choices)
@@ -212,7 +215,7 @@ def _run(given: Given) -> tuple[EventRun, tuple[str, ...]]:
 
 
 def _first_sides(phases: Phases, problem: Problem) -> Float[Array, "S"]:
-    """Return the sides of all comparisons at the start."""
+    """Return all sides (kinks.py) at the start: of the comparisons in forces, and zeros for joints that may stick."""
     of_kinks = jnp.full(sum(held.smooth.count for held in phases.held), FREE)
     free = jnp.concatenate([jnp.zeros(SIDES * len(phases.sticking)), of_kinks])
     at = problem.ts[0], problem.q, problem.v, free
@@ -223,7 +226,7 @@ _compiled_run, _deferred_run = on_host(eqx.filter_jit(_run)), deferred(_run)
 
 
 def _solution(mechanism: Any, given: Given, found: EventRun, reasons: tuple[str, ...], xp: ModuleType = jnp) -> Solution:
-    """Return the solution with the events that are listed; by jax.numpy, whose count is traced, padded to `max_events`."""
+    """Return the solution of a run, with its listed events; if their number is traced (jax.numpy), padded to `max_events`."""
     names = names_of_events(given.events, given.phases)
     changes = scene_changes(found, given.ts, given.events, given.phases, xp)
     found, kinks, sticking = listing(found, given.ts, given.events, given.phases, given.max_events, xp)
@@ -290,7 +293,7 @@ def _solution(mechanism: Any, given: Given, found: EventRun, reasons: tuple[str,
 def _with_joints_held_by_drivers(
     mechanism: Any, given: Given, found: EventRun, sticking: dict[str, Array] | None, xp: ModuleType
 ) -> dict[str, Array] | None:
-    """Return which joints stick at the output times, those included that drivers hold at rest."""
+    """Return masks of the output times at which joints stick, by joint, including those at which drivers hold joints at rest."""
     names = [x.name for x in given.phases.sticking if x.contact < 0]
     analysis = given.phases.analyses[SCENE]
     if not sticking or not names or not mechanism.drivers or analysis is None:

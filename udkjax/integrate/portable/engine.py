@@ -1,4 +1,4 @@
-"""The data of a portable engine: see the package."""
+"""The data of a portable engine, whose contents the docstring of the package lists."""
 
 import base64
 import zlib
@@ -42,9 +42,9 @@ class PortableEngine(NamedTuple):
     """The engine of a mechanism as data that a page runs.
 
     Attributes:
-        data: the engine as JSON: see the package.
+        data: the engine as JSON, with the contents that the docstring of the package lists.
         numbers: the numbers of the equations as a function of the parameters, for evaluation in Python.
-        mechanism: the mechanism that is simulated.
+        mechanism: the mechanism that the engine simulates.
     """
 
     data: JsonObject
@@ -70,9 +70,9 @@ def portable_engine(
         parameters: names of the numbers that may change, whole (`pin.A`) or one entry (`pin.A[0]`).
         rtol: relative tolerance of runs.
         atol: tolerance of runs, relative to the mechanism's scales, as in `simulate`.
-        pull: whether a hand may pull bodies: each body gets a spring, without stiffness until it is pulled.
+        pull: whether a hand may pull bodies: each body gets a spring, which has no stiffness until the body is pulled.
         runs: whether the engine integrates motions; if not, it closes positions and evaluates energies, and compiles faster.
-        events: the events of its runs, as for `simulate`.
+        events: the events of runs, as for `simulate`.
         drawn: whether the engine evaluates `drawn_points` as well.
 
     Returns:
@@ -127,7 +127,7 @@ def portable_engine(
 
 
 def _operation_of_rows(problem: Problem, events: PortableEvents) -> tuple[RunStates | None, JsonObject]:
-    """Return the operation of runs, None if a page has none, with `marks`, `shared`, and the reason `why` not."""
+    """Return the operation of runs, None if a page cannot run the scene, and the entries `marks`, `shared`, `why` of the data."""
     operation, why = problem.compiled.plan.operation, problem.compiled.plan.why_not_native
     found: JsonObject = {"marks": 0, "shared": None, "why": why}
     if why or operation is None:
@@ -144,20 +144,27 @@ def _operation_of_rows(problem: Problem, events: PortableEvents) -> tuple[RunSta
 
 
 def drawn_points(mechanism: Mechanism) -> list[tuple[str, Any]]:
-    """Return the points (n, 2) through which each link of a drawing is drawn, and pins of one link alone, in their frames (m)."""
+    """Return pairs of a body and points (n, 2) in its frame (m): those through which links are drawn, and pins of one link alone.
+
+    The list is empty for a mechanism without a drawing.
+    """
     if mechanism.drawing is None:
         return []
     return [*mechanism.drawing.shapes().items(), *((body, place[None]) for body, place in mechanism.drawing.free_pins().values())]
 
 
 def _may_move_by_redundancy(mechanism: Mechanism, analysis: Analysis) -> bool:
-    """Return whether constraints are redundant, not known to be independent, or as many as coordinates without the drivers'."""
+    """Return True if a mechanism may move only because some of its rows are redundant.
+
+    This is so if rows are redundant or not known to be independent, or if there are at least as many rows, without those of
+    drivers, as coordinates.
+    """
     undriven = len(analysis.row_names) - len(mechanism.driver_names)
     return analysis.redundant_rows != () or undriven >= 3 * len(mechanism.bodies)
 
 
 def floats(x: Any) -> str:
-    """Return numbers as base64 of float64."""
+    """Return numbers as a text: base64 of little-endian float64."""
     return base64.b64encode(np.asarray(x, "<f8").tobytes()).decode()
 
 
@@ -172,7 +179,7 @@ def _operation(operation: Operation) -> JsonObject:
 
 
 def _places(mechanism: Mechanism, pull: bool) -> JsonObject:
-    """Return the places in the vector of all numbers of the guess and of the pulls."""
+    """Return the entries `guess`, `pulls` and `masses` of the data: places in the vector of all numbers."""
     places = places_of_numbers(mechanism)
     guess = guess_of(places)
     pulls = [places.forces[PREFIX + name] for name in places.body_names] if pull else []
@@ -182,7 +189,7 @@ def _places(mechanism: Mechanism, pull: bool) -> JsonObject:
 
 
 def _problem(mechanism: Mechanism, analysis: Analysis, rtol: float, atol: float) -> Problem:
-    """Return a run as a template: the page replaces its times and its state."""
+    """Return the problem of a run, a template whose times and state the page replaces."""
     choices = Choices(rtol=rtol, atol=atol, drift_tol=DRIFT_PROJECTED, dt0=None, method=AUTO, stabilization=Projection())
     choices = choices._replace(max_steps=STEPS_OF_A_PAGE)
     compiled = compile_concrete(mechanism, analysis, *choices.of_mechanism)
@@ -192,7 +199,7 @@ def _problem(mechanism: Mechanism, analysis: Analysis, rtol: float, atol: float)
 
 
 def _run(operation: RunStates, problem: Problem, data: JsonObject, events: PortableEvents, scene: Mechanism) -> JsonObject:
-    """Return the modules of runs by an operation; their inputs go into the data."""
+    """Return the modules by which a page runs the scene; the entries that describe their inputs are put into `data`."""
     inputs = packed(problem)
     inputs_by_name = dict(zip(Operation.input_names, inputs, strict=False))
     data |= {
@@ -224,7 +231,7 @@ def _close(mechanism: Mechanism) -> JsonObject:
 
 
 def _closing(analysis: Analysis) -> JsonObject:
-    """Return the inputs of closing."""
+    """Return the entry `closing` of the data."""
     length, tol = float(analysis.scales.length), float(analysis.scales.rank_tol)
     return {"thresholds": [tol**2, 0.0], "settings": [length, tol], "tol": CLOSURE.tol, "rounding": CLOSURE.rounding}
 
@@ -232,7 +239,10 @@ def _closing(analysis: Analysis) -> JsonObject:
 def _evaluation(
     given: Mechanism, mechanism: Mechanism, code: RunPrograms, numbers: NumberProgram, data: JsonObject
 ) -> JsonObject:
-    """Return the module of evaluations of the mechanism of all phases; the list of its efforts goes into the data."""
+    """Return the module that evaluates states; `efforts`, `forces` and `friction` are put into `data`.
+
+    `given` is the scene, and `mechanism` the one that serves all phases.
+    """
     linked, evaluation = evaluation_module(code, [numbers.function()])
     data["efforts"] = [
         {"driver": name, "unit": driver.effort_unit, **places}
@@ -245,7 +255,7 @@ def _evaluation(
 
 
 def _driver_places(mechanism: Mechanism, code: RunPrograms) -> list[JsonObject]:
-    """Return the row of each driver, and its place in the solution of the linear system."""
+    """Return, for each driver, its row of Psi and the place of this row in the solution of the linear system."""
     names = [name for name, _ in code.row_names]
     rows = [names.index(name) for name in mechanism.driver_names]
     return [{"row": row, "place": code.eliminated_rows[row]} for row in rows]

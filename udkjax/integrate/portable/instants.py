@@ -1,10 +1,10 @@
-"""Instants of runs with events, for pages: all that a run does between two stretches of motion, as WebAssembly.
+"""Instants of runs with events, for pages: everything that a run does between two stretches of motion, as WebAssembly.
 
-The text is that of every run (integrate/events/instant), traced for one member and lowered. Its module exports `settle`, which
-applies the events at the present time, and, if joints may stick, `begin`, which decides which do at the start. Both take the
-address of a block of numbers (native/wasm/hosted.py), and ask their host about a state:
+The code is that of all runs (integrate/events/instant), traced for one member and lowered. The module exports `settle`, which
+applies the events at the present time, and, if joints may stick, `begin`, which decides which of them do at the start. Both take
+the address of a block of numbers (native/wasm/hosted.py), and ask their host about a state:
 
-    look        its conditions, with their rates, slopes, directions of impulses and forces
+    look        the conditions, with their rates, slopes, directions of impulses and forces
     project     q and v projected to the constraints of the phase, and the violation that is left
 """
 
@@ -50,7 +50,7 @@ class Instants:
     Attributes:
         plan: the phases and events, with room for the events of one instant.
         added: the joints that events add.
-        values: the values of conditions.
+        values: the layout of the values of conditions.
         n: the number of coordinates.
         listed: all events, and the phases, for `listing`.
     """
@@ -63,12 +63,12 @@ class Instants:
 
     @property
     def widths(self) -> list[int]:
-        """The number of numbers of each joint that events add, and of all sides."""
+        """The number of numbers of each joint that events add, then of all sides."""
         return [*(len(joint.program.outputs) for joint in self.added), self.plan.side_count]
 
     @property
     def inputs(self) -> dict[str, tuple[int, ...]]:
-        """The shapes of the inputs."""
+        """The shapes of the inputs of the functions, by name."""
         n, E, C = self.n, self.plan.count, len(self.plan.first)
         numbers = sum(len(joint.program.inputs) - n for joint in self.added)
         of_state = {"t": (), "q": (n,), "v": (n,), "phase": (C,), "joints": (sum(self.widths),), "event": (), "sides": (2 * E,)}
@@ -79,21 +79,21 @@ class Instants:
 
     @property
     def starts(self) -> dict[str, list[float]]:
-        """The values of inputs at the start of a run, where they are not zero."""
+        """The values of those inputs that are not zero at the start of a run, by name."""
         return {"event": [float(BEGIN)], "running": [1.0], "phase": [float(x) for x in self.plan.first]} | {
             "last_event_index": [-1.0]
         }
 
     @property
     def functions(self) -> dict[str, Callable[..., dict[str, Array]]]:
-        """The functions of the module, for `hosted_module`."""
+        """The functions that the module exports, by name, for `hosted_module`."""
         applied = {"settle": settle} | ({"begin": begin} if self.plan.sticking else {})
         return {name: partial(self._outputs, apply) for name, apply in applied.items()}
 
     def _outputs(
         self, apply: Callable[[Any, MemberRuns], MemberRuns], host: Mapping[str, Callable[..., Array]], *arrays: Array
     ) -> dict[str, Array]:
-        """Return the new values of inputs by name, the conditions that count, and the events of the instant, as listed."""
+        """Return the outputs of a function by name: new values of inputs, a mask of watched conditions, and the listed events."""
         given, plan = dict(zip(self.inputs, arrays, strict=True)), self.plan
         joints = tuple(x[None] for x in jnp.split(given["joints"], np.cumsum(self.widths)[:-1]))
         t, q, v = (given[name][None] for name in ("t", "q", "v"))
@@ -116,7 +116,7 @@ class Instants:
         return of_state | {"watched": watched} | self._listed(before, after)
 
     def _listed(self, before: MemberRuns, after: MemberRuns) -> dict[str, Array]:
-        """Return the events of the instant as `listing` lists them: their number, names, times, and states before."""
+        """Return the events of the instant as `listing` lists them: number, indices of their names, times, and states before."""
         of_instant = {name: x[0, 1:] for name, x in zip(RECORD, after.record, strict=True)}
         others = dict.fromkeys(EventRun._fields) | {
             "count": after.count[0] - 1,
@@ -131,7 +131,7 @@ class Instants:
 
     @property
     def imports(self) -> dict[str, tuple[dict[str, tuple[int, ...]], int]]:
-        """The functions of the host, for `hosted_module`."""
+        """The functions that the module imports from its host: shapes of the inputs and size of the output, by name."""
         state = {f"at_{name}": self.inputs[name] for name in ("t", "q", "v", "phase", "joints")}
         return {"look": (state, self.values.size), "project": (state, 2 * self.n + 1)}
 
@@ -153,11 +153,11 @@ class InstantMotion:
     def look(
         self, members: MemberIndices, at: RunState, is_free: bool = False, is_directed: bool = False, has_forces: bool = False
     ) -> StateValues:
-        """Evaluate a state."""
+        """Return the values of the conditions at a state; see `System.look`."""
         return self._of.values.values(self._ask("look", at)[None], jnp)
 
     def project(self, members: MemberIndices, at: RunState, is_free: bool = False) -> tuple[Array, Array, Array]:
-        """Return q and v projected to the constraints of the phase, and the largest remaining row of Psi_dot over its scale."""
+        """Return q and v projected to the constraints of the phase, and the largest remaining |Psi_dot_i| over its scale."""
         found, n = self._ask("project", at)[None], self._of.n
         return found[:, :n], found[:, n:-1], found[:, -1]
 
@@ -166,7 +166,7 @@ class InstantMotion:
         return self._host[name](at.t[0], at.q[0], at.v[0], at.phase[0].astype(float), joints)
 
     def add_joints(self, members: MemberIndices, new: Bool[Array, "1 A"], q: Float[Array, "1 n"], joints: Any) -> Any:
-        """Return the joints that events have added, with new ones, added at q."""
+        """Return `joints` in which the joints that are masked in `new` are added at the positions q."""
         found, start = [], 0
         for k, (joint, numbers) in enumerate(zip(self._of.added, joints[:-1], strict=True)):
             count = len(joint.program.inputs) - self._of.n
@@ -176,25 +176,25 @@ class InstantMotion:
         return (*found, joints[-1])
 
     def sides(self, members: MemberIndices, joints: Any) -> Float[Array, "1 S"]:
-        """Return the sides of the comparisons in forces."""
+        """Return all sides (1, S): the last entry of `joints`."""
         return joints[-1]
 
     def with_sides(self, members: MemberIndices, joints: Any, sides: Float[Array, "1 S"]) -> Any:
-        """Return `joints` with other sides."""
+        """Return `joints` with other sides, their last entry."""
         return (*joints[:-1], sides)
 
     def turned(self, members: MemberIndices, k: Int[Array, "1"], at: RunState) -> Float[Array, "1 S"]:
-        """Return the sides after an event; a page has no events at kinks."""
+        """Return all sides after an event: unchanged, since a page has no events at kinks."""
         return self.sides(members, at.joints)
 
     def when(self, mask: Bool[Array, "1"], change: Change, runs: MemberRuns) -> MemberRuns:
-        """Return the run with a change if the mask is true, else unchanged."""
+        """Return the run after a change if the mask is true, else unchanged."""
         return jax.lax.cond(mask[0], lambda runs: change(runs, None), lambda runs: runs, runs)
 
     def advance(self, runs: MemberRuns, members: MemberIndices) -> MemberRuns:
-        """Refuse: the host advances between two instants."""
+        """Raise `NotImplementedError`: the host advances the run between two instants."""
         raise NotImplementedError
 
     def repeat(self, change: Callable[[MemberRuns], MemberRuns], runs: MemberRuns) -> MemberRuns:
-        """Refuse: the host repeats instants."""
+        """Raise `NotImplementedError`: the host calls one instant after another."""
         raise NotImplementedError

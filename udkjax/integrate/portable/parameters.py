@@ -17,12 +17,12 @@ from udkjax.scene.numbers.number_fields import split_index
 
 
 def scalar_parameters(mechanism: Mechanism, names: Sequence[str] | None = None) -> dict[str, float]:
-    """Return parameters one number at a time: `joint.A.points[0][1]` for an entry of an array.
+    """Return parameters as single numbers by name, such as `joint.A.points[0][1]` for an entry of an array.
 
     Args:
         mechanism: the scene.
-        names: names of parameters or of entries; by default all parameters of the scene except numbers that follow from its
-            drawing: these would not follow changes of the drawing.
+        names: names of parameters or of entries; by default all parameters of the scene, except numbers that are computed from
+            its drawing: as parameters they would not follow changes of the drawing.
 
     Returns:
         The values by name, in order.
@@ -42,12 +42,12 @@ def scalar_parameters(mechanism: Mechanism, names: Sequence[str] | None = None) 
 
 
 class NumberProgram:
-    """The numbers of a mechanism's equations as a function of some parameters, followed by its breakpoints and further numbers.
+    """The numbers of a mechanism's equations, then its breakpoints and further numbers, as a function of some parameters.
 
     Attributes:
         base: the present values of all numbers.
-        changing: the outputs that depend on the parameters.
-        count: count of the numbers before the breakpoints.
+        changing: indices of the numbers that depend on the parameters.
+        count: number of the numbers before the breakpoints.
         knots: number of breakpoints.
     """
 
@@ -81,11 +81,14 @@ class NumberProgram:
         self._program, self.changing = traced_program(numbers, len(values))
 
     def function(self) -> Function:
-        """Return `numbers(parameters, numbers)`, which writes the numbers that depend on parameters."""
+        """Return the machine code of `numbers(parameters, numbers)`, which writes the numbers that depend on the parameters."""
         return vector_function(self._program, "numbers", "parameters", "numbers", self.changing)
 
     def function_along(self) -> Function:
-        """Return `numbers_along(parameters, numbers)`: from parameters, then their changes, the changes of numbers."""
+        """Return the machine code of `numbers_along(parameters, numbers)`, which writes the changes of these numbers.
+
+        Its input `parameters` has the parameters, followed by their changes.
+        """
 
         def along(x: Array) -> Array:
             return jax.jvp(self._numbers, (x[: self._parameters],), (x[self._parameters :],))[1]
@@ -94,14 +97,14 @@ class NumberProgram:
         return vector_function(program, "numbers_along", "parameters", "numbers", changing)
 
     def __call__(self, values: Sequence[float]) -> Float[np.ndarray, "numbers"]:
-        """Return all numbers, by NumPy."""
+        """Return all numbers for these values of the parameters, by NumPy."""
         numbers = self.base.copy()
         numbers[self.changing] = [float(x) for x in self._program([float(x) for x in values])]
         return numbers
 
 
 def traced_program(function: Callable[[Array], Array], count: int) -> tuple[ScalarProgram, list[int]]:
-    """Return a function of `count` numbers as a program of its outputs that depend on these, and the indices of the outputs."""
+    """Return a program of those outputs of a function that depend on its `count` inputs, and the indices of these outputs."""
     graph = Graph(np.float64)
     inputs, outputs = [graph.input(k, "parameter") for k in range(count)], list[Scalar]()
     if count:
@@ -112,7 +115,7 @@ def traced_program(function: Callable[[Array], Array], count: int) -> tuple[Scal
 
 
 def places_of_numbers(mechanism: Mechanism) -> Mechanism:
-    """Return a mechanism that has places in the vector of all numbers instead of the numbers."""
+    """Return the mechanism with each number replaced by its place in the vector of all numbers."""
     leaves, tree = jax.tree.flatten(mechanism.without_origin.without_samples)
     starts = np.cumsum([0, *(np.size(x) for x in leaves)])
     numbered = [np.arange(k, k + np.size(x)).reshape(np.shape(x)) for k, x in zip(starts, leaves, strict=False)]
@@ -120,7 +123,7 @@ def places_of_numbers(mechanism: Mechanism) -> Mechanism:
 
 
 def guess_of(mechanism: Mechanism) -> dict[str, np.ndarray]:
-    """Return the initial guesses q and v of all bodies, as they are in the mechanism."""
+    """Return the initial guesses "q" and "v" of all bodies as flat arrays; with `places_of_numbers`, the places of these."""
     bodies = mechanism.bodies.values()
     return {
         "q": np.concatenate([[*np.ravel(body.position), body.angle] for body in bodies]),
@@ -129,7 +132,7 @@ def guess_of(mechanism: Mechanism) -> dict[str, np.ndarray]:
 
 
 def _numbers(mechanism: Mechanism) -> list[Array | np.ndarray]:
-    """Return all numbers, with zeros instead of samples, and the breakpoints."""
+    """Return the vector of all numbers of a mechanism, with a row of zeros instead of samples, and the breakpoints."""
     breakpoints = mechanism.breakpoints
     stand_in = SampleRows(mechanism, breakpoints).stand_in(mechanism)
     return [numbers_as_vector(stand_in.numbers), np.zeros(0) if breakpoints is None else breakpoints]

@@ -50,12 +50,12 @@ def names_of_run(mechanism: Mechanism, events: Sequence[Event]) -> tuple[str, ..
 
 
 class PortableEvents:
-    """The events of the runs of a portable engine, those of joints with set-valued friction among them, and their phases.
+    """The events of the runs of a portable engine, including those of joints with set-valued friction, and their phases.
 
     Args:
         events: the events, as for `simulate`.
-        scene: the mechanism of all runs, with the springs of a page.
-        analysis: its analysis.
+        scene: the mechanism of all runs, with the springs by which a page pulls bodies.
+        analysis: the analysis of that mechanism.
 
     Raises:
         UnsupportedError: a condition has an operation without a machine instruction.
@@ -77,13 +77,13 @@ class PortableEvents:
         return events, phases
 
     def mechanism(self, scene: Mechanism) -> Mechanism:
-        """Return the mechanism of all phases, in the phase in which a run of a scene begins; its numbers may be traced."""
+        """Return the mechanism that serves all phases, with the numbers of a scene, maybe traced, in the first phase."""
         _, phases = self._prepared(scene)
         added = *phases.first_added(), jnp.zeros(SIDES * len(phases.sticking))
         return phases.mechanism(len(phases.mechanisms) - 1, jnp.asarray(self.plan.first), added)
 
     def numbers(self, scene: Mechanism) -> list[list[Array]]:
-        """Return the numbers of the conditions, of the actions, and of the joints that events add, which may be traced."""
+        """Return the numbers of the conditions, the actions, and the joints that events add: three lists of arrays."""
         if not self.events:
             return [[], [], []]
         events, phases = self._prepared(scene)
@@ -92,7 +92,7 @@ class PortableEvents:
 
     @cached_property
     def plan(self) -> EventPlan:
-        """The phases and events, with room for the events of one instant: all, each as it happens, lets go and rests."""
+        """The plan of the events, with room for those of one instant: each may happen, let go and rest."""
         most = 2 + 3 * len(self.events)
         by_velocity = () if self._conditions is None else self._conditions.by_velocity
         return event_plan(self.phases, self.events, np.iinfo(np.int32).max, most, by_velocity)
@@ -102,7 +102,7 @@ class PortableEvents:
         return with_forces(self._conditions, self.events, self.phases.switches, operation.code.row_count)
 
     def watched_by(self, operation: RunStates) -> RunStates:
-        """Return the run that ends where a condition or a force crosses zero."""
+        """Return the operation of a run that ends where a condition or a force crosses zero; the given one without events."""
         return operation.watching(self._watched(operation)) if self.events else operation
 
     def states_of(self, run: RunStates) -> EvaluateEvents:
@@ -115,7 +115,7 @@ class PortableEvents:
         return run.accelerations.jump
 
     def instants(self, run: RunStates) -> Instants:
-        """Return the code of all that happens at an instant."""
+        """Return the code of everything that happens at an instant."""
         values = ValuesLayout(self.states_of(run), self.phases.switches)
         n = self.phases.mechanisms[0].coordinate_count
         return Instants(self.plan, added_joints(self.phases), values, n, (self.events, self.phases))
@@ -124,8 +124,8 @@ class PortableEvents:
         """Return the events as data of a page.
 
         Args:
-            dressed: the mechanism of all phases.
-            instants: the code of all that happens at an instant.
+            dressed: the mechanism that serves all phases.
+            instants: the code of everything that happens at an instant.
             atol: the absolute tolerance of runs, in units of the scene.
         """
         plan, phases, switches = self.plan, self.phases, self.phases.switches

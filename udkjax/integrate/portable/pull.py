@@ -1,4 +1,4 @@
-"""Springs by which a hand pulls bodies: one for each body, without stiffness until it is pulled."""
+"""Springs by which a hand pulls bodies on a page: one for each body, without stiffness until the body is pulled."""
 
 import equinox as eqx
 import numpy as np
@@ -13,9 +13,9 @@ PREFIX = "pull of "  # prefix of the names of the elements
 
 
 class Pull(ForceElement):
-    """V = 1/2 stiffness |target - p|^2 with p a point of a body, and a load -damping dp/dt there.
+    """A spring and damper between a point p of a body and a target: V = 1/2 stiffness |target - p|^2, load -damping dp/dt at p.
 
-    Unlike `Spring` it has no direction, and so is smooth where its length is zero.
+    Unlike that of a `Spring`, its load is smooth where its length is zero, since it has no rest length.
 
     Args:
         bodies: the name of the body.
@@ -43,7 +43,7 @@ class Pull(ForceElement):
 
 
 def with_pulls(mechanism: Mechanism) -> Mechanism:
-    """Return a mechanism with a pull without stiffness for each body."""
+    """Return the mechanism with a further force element for each body: a `Pull` without stiffness."""
     none = {"point": np.zeros(2), "target": np.zeros(2), "stiffness": 0.0, "damping": 0.0}
     pulls = {PREFIX + name: Pull(bodies=(name,), **none) for name in mechanism.body_names}
     forces = {**mechanism.forces, **pulls}

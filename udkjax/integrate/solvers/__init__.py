@@ -48,9 +48,9 @@ def is_explicit(solver: "diffrax.AbstractSolver | None") -> bool:
 
 
 def has_method(solver: "diffrax.AbstractSolver | None") -> bool:
-    """Return True if `method_of` has the tableau of a solver: it is explicit, or singly diagonally implicit.
+    """Return True if `method_of` can convert a solver: a Runge-Kutta method, explicit or singly diagonally implicit.
 
-    An implicit tableau begins with an explicit stage and ends with the end of the step, like those of `diffrax.Kvaerno5`.
+    The first stage of an implicit tableau is explicit, and its last stage is the end of the step, as in `diffrax.Kvaerno5`.
     """
     if is_explicit(solver):
         return True
@@ -65,7 +65,7 @@ def has_method(solver: "diffrax.AbstractSolver | None") -> bool:
 
 
 def method_of(solver: "diffrax.AbstractRungeKutta | None") -> Method:
-    """Return the tableau of a solver; None is the default."""
+    """Return the method of a solver for machine code, with its tableau; None is the default, Dopri8."""
     if solver is None:
         return DOPRI8
     import diffrax

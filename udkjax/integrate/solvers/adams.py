@@ -77,7 +77,7 @@ class OrderControl(eqx.Module):
 
 
 def first_order_control(h: Float[Array, ""]) -> OrderControl:
-    """Return the state for a history of one value, with a first step h."""
+    """Return the state at a start: order one, a history of one value, and a first step h."""
     return OrderControl(jnp.array(1), jnp.asarray(h), jnp.array(1), jnp.array(True))
 
 
@@ -116,7 +116,7 @@ def choose_order(
 
 
 def step_factor(error: Float[Array, ""], order: Int[Array, ""]) -> Float[Array, ""]:
-    """Return the factor of a step with this error by a method of this order."""
+    """Return the factor for the step after one with this error, relative to the tolerance, by a method of this order."""
     factor = (SHARE / jnp.maximum(error, TINY)) ** (1 / (order + 1))
     return 2 ** (jnp.floor(RUNGS * jnp.log2(jnp.clip(factor, SMALLEST, LARGEST))) / RUNGS)
 
@@ -222,7 +222,7 @@ class Adams(Multistep):
         return y1, y_error, dense, new, diffrax.RESULTS.successful
 
     def _begin(self, h: Float[Array, ""], y: Vector, f: Vector, evaluations: Int[Array, ""]) -> History:
-        """Return a history of one value."""
+        """Return the history at a start, whose only value is f, the derivative at y; h is the first step."""
         rows, one_point = self.max_order + 2, jnp.array(1)
         phi = jnp.zeros((rows, len(y)), y.dtype).at[0].set(f)
         return History(
@@ -239,9 +239,10 @@ class Adams(Multistep):
     def _update_newest(
         self, f: Field, t0: Float[Array, ""], h: Float[Array, ""], y: Vector, state: History, made_jump: Flag
     ) -> tuple[History, Bool[Array, ""]]:
-        """Return the history with f(t0, y) as its newest value, or a new history; and whether y is not the end of the last step.
+        """Return the history with f(t0, y) as its newest value, or a new history, and whether y was displaced.
 
-        If y was displaced, it will be displaced again: f at the end of this step is then left for the next step to evaluate.
+        A displaced y, as after a projection, is not the end of the last step. It will be displaced again after this step, so that
+        evaluating f at its end is left to the next step.
         """
         displaced = jnp.max(jnp.abs(y - state.y), initial=0.0) > SAME_STATE * jnp.max(jnp.abs(y), initial=0.0)
         stale = displaced | ~state.exact | made_jump
@@ -254,7 +255,10 @@ class Adams(Multistep):
     def _correct(
         self, f: Callable[[Vector], Vector], y: Vector, slope: Vector, rule: StepCoefficients, size: Size, state: History
     ) -> tuple[Vector, Bool[Array, ""], Int[Array, ""], Float[Array, ""]]:
-        """Return the excess d of f over its extrapolated value `slope`, whether it converged, the calls of f, and the rate."""
+        """Return the excess d of f over its extrapolated value `slope`, with the result of the iteration.
+
+        The result is: whether d converged, the number of calls of f, and the rate of convergence.
+        """
         if self.corrector == "pece":
             return f(y) - slope, jnp.array(True), jnp.array(1), state.rate
         k = state.control.order

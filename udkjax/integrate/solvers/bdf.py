@@ -47,9 +47,9 @@ REPEATED = 1e-3  # relative: a step smaller than planned by more than this was r
 
 
 class BDFState(eqx.Module):
-    """The state of the solver after a step: the history, and the choices.
+    """The state of the solver after a step: the history, and the choice of order and step.
 
-    It stores the modified divided differences of the states accepted at times[0], times[1], ..., newest first,
+    The history is stored as the modified divided differences of the states accepted at times[0], times[1], ..., newest first,
 
         phi[i] = (times[0] - times[1]) ... (times[0] - times[i]) y[times[0], ..., times[i]],
 
@@ -58,7 +58,7 @@ class BDFState(eqx.Module):
 
     times: Float[Array, "m"]
     phi: Float[Array, "m n"]
-    points: Int[Array, ""]  # number of states in the history
+    points: Int[Array, ""]  # number of accepted states in the history
     order: Int[Array, ""]  # order of the next step
     wait: Int[Array, ""]  # steps before another order is considered
     planned: Float[Array, ""]  # the next step
@@ -71,7 +71,7 @@ class BDFState(eqx.Module):
 
     @property
     def jacobians(self):
-        """Number of Jacobians; each also evaluates the vector field once, which counts as an evaluation."""
+        """Number of Jacobians. Each also evaluates the vector field once, and is included in `evaluations`."""
         return self.newton.jacobians
 
     @property
@@ -150,7 +150,7 @@ class BDF(Multistep):
         t1: Float[Array, ""],
         y: Float[Array, "n"],
     ) -> BDFState:
-        """Return a history of one state, extrapolated at the rate f."""
+        """Return the history at a start: one state y, and states before it extrapolated at the rate f."""
         m, h = self.max_order + 2, t1 - t0
         phi = jnp.zeros((m, len(y)), y.dtype).at[0].set(y).at[1].set(h * f)
         one, iteration = (
@@ -249,7 +249,7 @@ class BDF(Multistep):
 
 
 class _Size(eqx.Module):
-    """The controller's norm of a vector, relative to a scale, times a factor."""
+    """A function of vectors: the controller's norm of x / scale, times a factor."""
 
     norm: Callable[[PyTree[Array]], Float[Array, ""]]
     unravel: Unravel = eqx.field(static=True)
@@ -261,7 +261,7 @@ class _Size(eqx.Module):
 
 
 def _weights(times: Float[Array, "m"], t: Float[Array, ""]) -> Float[Array, "m"]:
-    """Return the weights of phi in the value of its polynomial at t."""
+    """Return the weights w of the differences phi at a time t, where the polynomial of the history is sum_i w_i phi_i."""
     return jnp.concatenate([jnp.ones(1, times.dtype), jnp.cumprod((jnp.asarray(t) - times[:-1]) / (times[0] - times[1:]))])
 
 
@@ -281,6 +281,6 @@ def _errors(k: Int[Array, ""], alpha: Float[Array, "m"], phi: Float[Array, "m n"
 
 
 def _factor(error: Float[Array, "*k"], order: Int[Array, "*k"], below: Array | float) -> Float[Array, "*k"]:
-    """Return the factor of a step whose error would be the tolerance divided by `below`."""
+    """Return the factor by which a step with this error has to change for an error of the tolerance divided by `below`."""
     size = jnp.power(below * error, 1 / (order + 1))
     return 1 / (size + NO_DIVISION_BY_ZERO)

@@ -13,7 +13,7 @@ NOT_COUNTED = -1  # count before the first step, which also returns the evaluati
 
 
 class Tally(eqx.Module):
-    """An error estimate, and the calls of the vector field in the attempt and before it; None if unknown."""
+    """The error estimate of an attempted step, and the numbers of calls of the vector field in and before it; None: unknown."""
 
     error: PyTree[Array]
     evaluations: Int[Array, ""] | None
@@ -21,10 +21,10 @@ class Tally(eqx.Module):
 
 
 def tally(solver: diffrax.AbstractSolver, error: PyTree, before: PyTree, after: PyTree, made_jump: Bool[ArrayLike, ""]) -> Tally:
-    """Count the calls of an attempt, from the solver's states before and after it.
+    """Return the tally of an attempted step, from the solver's states before and after it.
 
-    The calls are known for explicit Runge-Kutta methods, from their tableau, and for methods whose state has a field
-    `evaluations`, the calls so far.
+    The numbers of calls are known for explicit Runge-Kutta methods, from their tableau, and for methods whose state has a field
+    `evaluations`, the number of calls so far.
     """
     if hasattr(before, "evaluations"):
         return Tally(error, after.evaluations - before.evaluations, before.evaluations)
@@ -49,7 +49,7 @@ class Wrapper(diffrax.AbstractAdaptiveSolver, diffrax.AbstractWrappedSolver):
 
     @property
     def scan_kind(self):
-        """The kind of the loop over the stages of a Runge-Kutta method, which some adjoints choose."""
+        """The kind of the loop over the stages of a Runge-Kutta method; some adjoints of diffrax set it."""
         return self.solver.scan_kind  # pyright: ignore[reportAttributeAccessIssue]
 
     @property
@@ -140,7 +140,7 @@ def count_evaluations(
 
 
 def evaluations(controller_state: PyTree) -> Int[Array, ""]:
-    """Return the calls of the vector field by a run's solver, or -1 if unknown or without a step.
+    """Return the number of calls of the vector field by a run's solver; -1 if it is unknown, or the run took no step.
 
     Calls to choose the first step are not included.
     """

@@ -48,7 +48,7 @@ class StepCoefficients(eqx.Module):
     errors: Float[Array, "N"]  # h sigma_j |gamma*_j|: times phi_{j+1}(n+1), the local error of order j for constant steps h
 
     def gains(self, k: Int[Array, ""]) -> Float[Array, ""]:
-        """Return the ratio to d of the difference between the results of orders k and k + 1."""
+        """Return the difference between the results of orders k and k + 1, over d: a positive number."""
         return self.h * jnp.abs(self.g[k - 1] - self.g[k])
 
 
@@ -70,7 +70,7 @@ def integrate_basis(s: Float[Array, ""], h: Float[Array, ""], ages: Float[Array,
 
 
 class DifferenceInterpolation(diffrax.AbstractLocalInterpolation):
-    """The integral of the polynomial of a step, of the step's order."""
+    """The states within an accepted step: y0 plus the integral of the polynomial of f, of the order of the step."""
 
     t0: Float[Array, ""]
     t1: Float[Array, ""]

@@ -64,13 +64,13 @@ def steer_error(
 
 
 def vector_field(terms: PyTree[diffrax.AbstractTerm], t: Float[Array, ""], y: PyTree[Array], args: PyTree) -> Float[Array, "n"]:
-    """Return the derivative of y, as a vector."""
+    """Return the derivative of y by the terms of a diffrax problem, as a vector."""
     unit = terms.contr(jnp.zeros_like(t), jnp.ones_like(t))  # unit control of the term
     return ravel_pytree(terms.vf_prod(t, y, args, unit))[0]
 
 
 def count_called(name: str) -> Callable[[Any], int]:
-    """Return a converter to a whole number of at least 1, for a static field: an array cannot be compared."""
+    """Return a converter of the argument `name` to an int of at least 1, for static fields, which cannot be arrays."""
 
     def convert(value: Any) -> int:
         require_count(name, value)
@@ -80,7 +80,7 @@ def count_called(name: str) -> Callable[[Any], int]:
 
 
 def check_orders(least: int, most: int, highest: int) -> None:
-    """Raise ValueError for orders that a family of methods lacks."""
+    """Raise `ValueError` unless the orders `least` and `most` of a method satisfy 1 <= least <= most <= highest."""
     for name, order in (("min_order", least), ("max_order", most)):
         require_count(name, order, least=-math.inf)
     if not 1 <= least <= most <= highest:

@@ -95,10 +95,13 @@ class _Iteration(eqx.Module):
 def solve(
     equation: Implicit, size: Callable[[Float[Array, "n"]], Float[Array, ""]], state: NewtonState, iterations: int
 ) -> tuple[Float[Array, "n"], Bool[Array, ""], NewtonState]:
-    """Return e, whether it was found, and the state for the next step.
+    """Return e, whether the iteration converged, and the state for the next step.
 
-    `size` is a callable pytree: the size of a correction, to be less than one. The iteration fails after `iterations` iterations
-    with one matrix.
+    Args:
+        equation: the equation for e.
+        size: a function, as a pytree, that returns the size of a correction; e has converged if its error is of size one or less.
+        state: the state after the last step.
+        iterations: the number of iterations with one matrix after which the iteration fails.
     """
     renew = state.jacobian_age >= JACOBIAN_STEPS
     factor = renew | (state.matrix_age >= MATRIX_STEPS) | ~(jnp.abs(equation.c / state.c - 1) <= CHANGE)
@@ -140,7 +143,7 @@ def _(primals, tangents):
 def _matrices(equation: Implicit, now: _Iteration) -> tuple[Float[Array, "n"], NewtonState]:
     """Return f, and the state with a new J and a new M if they are due.
 
-    Each is computed in a branch: under vmap it is skipped as long as no member needs it.
+    J and M are each computed in a branch, which under vmap is skipped as long as no member needs it.
     """
     state, renew = now.state, now.renew
 

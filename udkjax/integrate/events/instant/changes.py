@@ -22,7 +22,9 @@ from udkjax.scene.elements.joints import Constraint
 def scene_changes(
     found: EventRun, ts: Float[Any, "T"], events: Sequence[Event], phases: Phases, xp: ModuleType
 ) -> SceneChanges | None:
-    """Return which constraints hold at the output times, without those by which joints stick; None if events change none.
+    """Return the `SceneChanges` of a run: the constraints that hold at the output times; None if events change no constraints.
+
+    Locks of joints that stick are left out.
 
     Args:
         found: The run, with all its events.
@@ -56,7 +58,7 @@ class _ChangingScene(NamedTuple):
     """The part of `SceneChanges` that is the same for all runs."""
 
     switches: tuple[int, ...]  # indices of the switches, without those of joints that stick
-    adding: tuple[int, ...]  # the events of the joints that events add
+    adding: tuple[int, ...]  # the event that adds each added joint
     guess: Float[Any, "1 n"]  # initial guess of the scene
     fields: dict[str, Any]  # the other fields of `SceneChanges`
 
@@ -92,7 +94,7 @@ def _concrete_scene(phases: Phases, *events: Event) -> _ChangingScene:
 
 
 def _contacts(events: Sequence[Event], phases: Phases) -> dict[int, tuple[str, Constraint]]:
-    """Return the joints that hold contacts at rest with their names, by the event of the contact."""
+    """Return the name and the joint by which each contact is held at rest, by the index of the event of the contact."""
     switches, found = phases.switches, {}
     for event, x in enumerate(events):
         if x.action.rest == "hold":
@@ -102,7 +104,7 @@ def _contacts(events: Sequence[Event], phases: Phases) -> dict[int, tuple[str, C
 
 
 def _friction(contact: Event, joint: str) -> Friction:
-    """Return the friction of a contact with its set-valued law, in the joint that holds it."""
+    """Return the friction of a contact with the set-valued law, in the joint by which the contact is held."""
     action: Any = contact.action
     numbers = {"coefficient": action.coefficient, "static_coefficient": action.static_coefficient}
     return Friction(joint=joint, law="set-valued", **numbers)

@@ -30,8 +30,8 @@ class Gaps(NamedTuple):
     """The contacts at an event, in the positions before they are closed."""
 
     rows: ContactRows
-    g: Float[Any, "*m E"]
-    scale: Float[Any, "*m E"]
+    g: Float[Any, "*m E"]  # the values of the conditions
+    scale: Float[Any, "*m E"]  # the scales of the conditions
     counts: Bool[Any, "*m E"]  # contacts that must not be pushed below zero
 
 
@@ -40,7 +40,7 @@ def close_contacts(system: System, gaps: Gaps, after: RunState) -> Float[Any, "*
 
     Args:
         system: the system.
-        gaps: the contacts.
+        gaps: the gaps of the contacts at the event.
         after: the states after the event.
     """
     plan, xp, (rows, g, scale, counts) = system.plan, system.xp, gaps

@@ -24,7 +24,7 @@ LONGEST = ZERO ** (1 / 3)
 
 
 def ends_hop(system: System, runs: MemberRuns) -> Bool[Any, "B"]:
-    """Return a mask of the members in which a contact lands, perhaps from a hop, while others are held."""
+    """Return a mask of the members in which a contact lands, perhaps from a hop, while other contacts are held."""
     plan, xp, is_event = system.plan, system.xp, (runs.event >= 0) & (runs.event < system.plan.count)
     lands = is_event & xp.asarray(plan.impacts)[runs.event % plan.count]
     return runs.running & lands & (runs.count > 0) & xp.any(plan.held(runs.phase, xp), axis=-1)

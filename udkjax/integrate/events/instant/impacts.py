@@ -74,14 +74,14 @@ OPEN, TOUCHES, SLOW = 0, 1, 2  # the states of a contact at an event: not closed
 
 
 class Contacts(NamedTuple):
-    """The contacts among E events, independent of the state."""
+    """The properties of the contacts among E events that do not depend on the state."""
 
     impacts: Bool[np.ndarray, "E"]  # events that are contacts
     hold: Bool[np.ndarray, "E"]  # contacts that are held at rest
     stop: Bool[np.ndarray, "E"]  # contacts that end the run at rest
     tangents: Int[np.ndarray, "E"]  # the row of the speed along the line of each contact with friction; -1: it has none
-    restitution: Float[Any, "*m E"]
-    friction: Float[Any, "*m E"]  # coefficients
+    restitution: Float[Any, "*m E"]  # coefficients of restitution
+    friction: Float[Any, "*m E"]  # coefficients of friction
     rate: Float[Any, "*m"]  # characteristic rate of the system and the run (1/s)
 
 
@@ -105,16 +105,16 @@ class KnownContacts(NamedTuple):
     """States of the contacts at an event, as the run found them; its derivatives reuse them."""
 
     closed: Int[Any, "*m E"]  # OPEN, TOUCHES or SLOW
-    held: Bool[Any, "*m E"]  # after the event
+    held: Bool[Any, "*m E"]  # whether each contact is held after the event
 
 
 class ContactChanges(NamedTuple):
     """The contacts at an event, and their states after it."""
 
-    v: Float[Any, "*m n"]  # after the event
+    v: Float[Any, "*m n"]  # velocities after the event
     closed: Int[Any, "*m E"]  # OPEN, TOUCHES or SLOW, with those whose rebound was left out
-    hits: Bool[Any, "*m E"]
-    held: Bool[Any, "*m E"]  # after the event
+    hits: Bool[Any, "*m E"]  # contacts that hit at the event
+    held: Bool[Any, "*m E"]  # contacts that are held after the event
     rests: Bool[Any, "*m E"]  # contacts that do not separate after the event, held or not
     ends: Bool[Any, "*m E"]  # contacts whose rest ends the run
     carried: Bool[Any, "*m E"]  # contacts kept at zero by other held contacts
@@ -135,7 +135,7 @@ def contact_rows(
 def rows_of_directions(
     normals: Float[Any, "*m E n"], directions: Float[Any, "*m E n"], inverse_mass: Float[Any, "*m n"]
 ) -> ContactRows:
-    """Return the rows of contacts from given directions of impulses."""
+    """Return the rows of contacts where M is diagonal, from the directions of impulses, M^(-1/2) u, and 1 / M."""
     mobility = inverse_mass[..., None, :]
     W, given = directions / mobility @ directions.swapaxes(-1, -2), (normals**2 * mobility).sum(-1)
     return ContactRows(W, directions, (directions**2 / mobility).sum(-1) > BLOCKED * given)
@@ -161,8 +161,8 @@ def impulses_of_impact(
     """Return the impulses of an impact by Newton's law with complementarity.
 
     Args:
-        rows: of all conditions.
-        rate: g_dot before it.
+        rows: the rows of all conditions.
+        rate: g_dot before the impact.
         restitution: e of each contact, from 0 to 1.
         closed: mask of the contacts that take part; they do not separate.
         floor: tolerance on rates >= 0.
@@ -183,7 +183,10 @@ def impulses_with_friction(
     floor: Float[Any, "*m E"],
     xp: ModuleType = jnp,
 ) -> Impulses:
-    """Return the impulses of an impact with friction by Poisson's law of restitution (`rubbing_impact`)."""
+    """Return the impulses of an impact with friction by Poisson's law of restitution (`rubbing_impact`).
+
+    The arguments after `contacts` are those of `impulses_of_impact`.
+    """
     normals = np.flatnonzero(contacts.impacts)
     rubbing = np.flatnonzero(contacts.tangents[normals] >= 0)  # among the normals
     along = contacts.tangents[normals[rubbing]]
@@ -249,10 +252,10 @@ def hit_contacts(
     known: KnownContacts | None,
     xp: ModuleType = jnp,
 ) -> ContactChanges:
-    """Apply an impact to all closed contacts, and determine which of them then rest.
+    """Return the velocities after an impact of all closed contacts, and the contacts that then rest.
 
     Args:
-        contacts: properties that do not depend on the state.
+        contacts: the properties of the contacts that do not depend on the state.
         k: the index of the event; E + i if contact i opens.
         v: the velocities that the next phase without its contacts allows.
         held: mask of the contacts that were held before.
@@ -260,7 +263,7 @@ def hit_contacts(
         rows: the rows of the conditions in that phase.
         rate: the first rates of all conditions at v; of sliding along a line, the speeds.
         second_rates: maps velocities to the second rates of all conditions in that phase.
-        known: the contacts, which leave nothing to decide; None: not known yet.
+        known: the states of the contacts, as a run has determined them; None: they are determined here.
         xp: jax.numpy, or NumPy.
     """
     stop: Callable[[Any], Any] = (lambda x: x) if xp is np else stop_gradients
@@ -323,7 +326,7 @@ def hit_contacts(
 
 
 def _where_any(mask: Bool[Any, "*m E"], x: Any, y: Any, xp: ModuleType) -> Any:
-    """Return x of members with a masked event, y of all others."""
+    """Return the values x for members with any masked event, and y for all others."""
     chosen = xp.any(mask, axis=-1)
     return xp.where(chosen.reshape(*chosen.shape, *[1] * (x.ndim - chosen.ndim)), x, y)
 
@@ -331,7 +334,7 @@ def _where_any(mask: Bool[Any, "*m E"], x: Any, y: Any, xp: ModuleType) -> Any:
 def _depends(
     W: Float[Any, "*m E E"], held: Bool[Any, "*m E"], impacts: Bool[np.ndarray, "E"], xp: ModuleType
 ) -> Bool[Any, "*m E"]:
-    """Return a mask of the contacts that depend on the held ones."""
+    """Return a mask of the contacts that are not held, but whose rows depend on those of the held ones."""
     among = np.flatnonzero(impacts)
     W, basis, places = W[..., among, :][..., among], held[..., among], np.eye(len(impacts), dtype=bool)[among]
     least = CARRIED * diagonal(W, xp)

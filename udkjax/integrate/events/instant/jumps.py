@@ -32,7 +32,7 @@ from udkjax.transforms.gradients import stop_gradients
 
 
 class JumpResult(NamedTuple):
-    """States of b members after an event, their contacts, and a `Result` for each."""
+    """The states of b members after an event, the changes of their contacts, and a `Result` for each member."""
 
     state: RunState
     contacts: ContactChanges | None  # None if no event is an impact
@@ -53,13 +53,13 @@ def apply_event(
 
     Args:
         system: the system.
-        members: the members.
+        members: the indices of the members; None: all.
         k: indices of the events.
-        before: their states before the event.
+        before: the states of the members before the event.
         values: the conditions in these states.
         state_values: derivatives of the conditions, and directions of impulses.
-        known: the contacts of the event; None: not known yet.
-        modes: the modes of joints with set-valued friction after the event; None: not known yet.
+        known: the states of contacts at the event, from the run that is differentiated; None: they are determined here.
+        modes: the modes of joints with set-valued friction after the event; None: they are determined here.
     """
     found, gaps = _apply_event(system, members, k, before, values, state_values, known)
     if system.plan.sticking:
@@ -70,7 +70,7 @@ def apply_event(
 def _settle_friction(
     system: System, members: MemberIndices, k: Int[Any, "b"], found: JumpResult, modes: FrictionModes | None
 ) -> JumpResult:
-    """Return the states after events with the modes of all joints that may stick."""
+    """Return the result of an event with the modes of all joints that may stick, which are decided here unless given."""
     plan, xp, contacts = system.plan, system.xp, found.contacts
     stopped = xp.where(xp.asarray(plan.slides)[k % plan.count], k, NO_EVENT)
     resting = None if contacts is None else contacts.rests
@@ -89,7 +89,10 @@ def _apply_event(
     state_values: StateValues,
     known: KnownContacts | None,
 ) -> tuple[JumpResult, Gaps | None]:
-    """Apply events, except the decisions of joints with set-valued friction; return the contacts, too, if any are closed."""
+    """Apply events, except for decisions about joints with set-valued friction.
+
+    Also return the gaps of the contacts, for `close_contacts`; None if no contact can push another one.
+    """
     plan, xp = system.plan, system.xp
     releases, e = k >= plan.count, k % plan.count
     t, q, v, phase, joints = before
@@ -145,7 +148,7 @@ def _apply_event(
 
 
 def _contacts(system: System, members: MemberIndices) -> Contacts:
-    """Return the contacts of members."""
+    """Return the properties of the contacts of members."""
     plan, numbers = system.plan, system.numbers_of_actions(members)
     restitution, friction = (numbers[:, NUMBERS_OF_ACTIONS.index(name)] for name in ("rebound", "friction"))
     given = restitution, friction, take(system.rate, members)

@@ -1,4 +1,4 @@
-"""The events of a run that are listed for the user: no kinks, but joints that stick, slip or reverse, by name."""
+"""The events of a run that are listed for the user: no kinks, but joints that stick, slip or reverse, each by its name."""
 
 from collections.abc import Sequence
 from types import ModuleType
@@ -17,25 +17,28 @@ STICKS, SLIPS, TURNS = range(3)
 
 
 class Kinks(NamedTuple):
-    """Number of kinks of the forces in a run, and the time (s) from which they are no longer located."""
+    """The kinks of forces that a run has located."""
 
     count: Int[Array, ""]
-    unlocated: Float[Array, ""]  # the time from which they are not located (s); else infinite
+    unlocated: Float[Array, ""]  # the time (s) from which kinks are not located; infinite if all are
 
 
 class Listing(NamedTuple):
     """A run with its listed events, its kinks, and the joints that stick."""
 
     run: EventRun  # `event_index` is an index of the names of events
-    kinks: Kinks | None  # None without any
+    kinks: Kinks | None  # None if no forces have kinks
     sticking: dict[str, Bool[Array, "T"]] | None  # by joint, at the output times; None without set-valued friction
 
 
 def names_of_events(events: Sequence[Event], phases: Phases) -> tuple[str, ...]:
-    """Return the names of all events that may be listed, "" in places of those that cannot happen: only contacts rest.
+    """Return the names of all events that may be listed, in the order of their indices.
+
+    Each event of the user has an index; then each has one for "lets go" and one for "rests", with the name "" unless it is a
+    contact; the transitions of joints that may stick follow.
 
     Args:
-        events: The user's, then those of joints that stick, then kinks.
+        events: All events: those of the user, of joints that may stick, and at kinks.
         phases: The phases.
     """
     own = events[: _own_count(events, phases)]
@@ -50,7 +53,7 @@ def _own_count(events: Sequence[Event], phases: Phases) -> int:
 def listing(
     found: EventRun, ts: Float[Any, "T"], events: Sequence[Event], phases: Phases, max_events: int, xp: ModuleType
 ) -> Listing:
-    """Return the events of a run that are listed.
+    """Return a run with only those events that are listed for the user, its kinks, and the joints that stick.
 
     Args:
         found: The run.
@@ -98,7 +101,7 @@ def listing(
 
 
 def _turn(phases: Phases, found: EventRun, slides: Bool[Any, "k F"], xp: ModuleType) -> Bool[Any, "k F"]:
-    """Return which joints slide in another direction after each event than before it."""
+    """Return a mask of the joints that slide in opposite directions before and after each event."""
     places = [x.first for x in phases.sticking]
     after, first = found.sides[:, places], found.first_sides[None, places]
     return slides & (xp.concatenate([first, after[:-1]]) * after < 0)
@@ -109,6 +112,6 @@ def _first(found: EventRun) -> tuple[Any, Any]:
 
 
 def _stick(phases: Phases, phase: Bool[Any, "k C"], sides: Float[Any, "k S"], xp: ModuleType) -> Bool[Any, "k F"]:
-    """Return which joints stick: they are locked, or kept at rest by others that are."""
+    """Return a mask of the joints that stick: they are locked, or kept at rest by other joints that are locked."""
     locks = np.array([phases.switches.contacts[x.event] for x in phases.sticking], int)
     return phase[:, locks] | (sides[:, [x.first + 1 for x in phases.sticking]] > 0.5)

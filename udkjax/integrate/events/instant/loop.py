@@ -33,7 +33,7 @@ CLOSED_FIELD, INDEX_FIELD = RECORD.index("closed"), RECORD.index("event_index")
 
 
 def run_loop(system: System, runs: MemberRuns) -> MemberRuns:
-    """Run from the start to the last output time, or to an event that ends the run."""
+    """Return the runs, led from their start to the last output time or to an event that ends them."""
     if system.plan.sticking:
         runs = begin(system, runs)
         runs = runs._replace(first_phase=runs.phase + False, first_sides=system.sides(None, runs.joints) + 0.0)
@@ -46,19 +46,19 @@ def run_loop(system: System, runs: MemberRuns) -> MemberRuns:
 
 
 def begin(system: System, runs: MemberRuns) -> MemberRuns:
-    """Return the runs with the modes of all joints that may stick at their start."""
+    """Return the runs at their start, with the modes of all joints that may stick decided."""
     return system.when(runs.running, partial(begin_with_friction, system), runs)
 
 
 def settle(system: System, runs: MemberRuns) -> MemberRuns:
-    """Return the runs after all changes at their present times, before they advance again."""
+    """Return the runs after the next event at their present times, if any; `event` is AGAIN where another may follow at once."""
     if system.plan.held_at_rest.sum() > 1:
         runs = system.when(ends_hop(system, runs), partial(return_to_top, system), runs)
     return system.when(runs.running, partial(_settle, system), runs)
 
 
 def _settle(system: System, runs: MemberRuns, members: MemberIndices) -> MemberRuns:
-    """Return the runs with all changes of members at their present times: at the start, after an event, or at a crossing."""
+    """Return the runs after the next event, if any, of members at their present times: at the start, a crossing or an event."""
     plan, xp, E = system.plan, system.xp, system.plan.count
     state, event, sides = runs.state(members), take(runs.event, members), take(runs.sides, members)
     values, state_values = condition_values(system, members, state)
@@ -122,7 +122,7 @@ def _settle(system: System, runs: MemberRuns, members: MemberIndices) -> MemberR
 
 
 def _settled(system: System, runs: MemberRuns, members: MemberIndices) -> Bool[Any, "b E"]:
-    """Return a mask of the conditions settled by the last event: of its contacts, and its own if the event changes nothing."""
+    """Return a mask of the conditions that the last event has settled: of its contacts, and its own if it changes nothing."""
     xp, plan = system.xp, system.plan
     last = xp.maximum(take(runs.count, members) - 1, 0)
     indices = np.arange(len(runs.t)) if members is None else members
@@ -133,7 +133,7 @@ def _settled(system: System, runs: MemberRuns, members: MemberIndices) -> Bool[A
 def _jump(
     system: System, runs: MemberRuns, members: MemberIndices, values: ConditionValues, state_values: StateValues
 ) -> MemberRuns:
-    """Apply the events of members, and record them with the contacts that take part."""
+    """Return the runs after the events of members, which are recorded with the contacts that take part."""
     plan, xp, E, K = system.plan, system.xp, system.plan.count, system.plan.room
     k, before = take(runs.event, members), runs.state(members)
     sides, carried = take(runs.sides, members), take(runs.carried, members)
@@ -214,7 +214,7 @@ def _jump(
 def _stands(
     system: System, members: MemberIndices, e: Int[Any, "b"], after: RunState, values: ConditionValues, found: StateValues
 ) -> Bool[Any, "b"]:
-    """Return whether a joint that event e adds stops its condition, which stays where it happened: on neither side of zero."""
+    """Return a mask of the members in which a joint that event e adds stops its condition, which then stays at zero."""
     xp, own = system.xp, np.arange(system.plan.count) == e[:, None]
     rate = found.by_t + xp.sum(found.by_q * after.v[:, None], axis=-1)
     slow = xp.abs(rate) <= ZERO_RATE * values.scale * take(system.rate, members)[:, None]
@@ -223,7 +223,10 @@ def _stands(
 
 
 def _carried(system: System, members: MemberIndices, carried: Bool[Any, "b E"], joints: Any) -> Bool[Any, "b E"]:
-    """Return a mask of the conditions that do not count: of contacts that are carried, and of sides that do not hold."""
+    """Return a mask of the conditions that are not watched.
+
+    These are the conditions of carried contacts, of directions in which joints do not slide, and of kinks whose sides are free.
+    """
     plan, sides = system.plan, system.sides(members, joints)
     if plan.sticking:
         carried = (carried & ~plan.slides) | plan.not_sliding(sides, system.xp)

@@ -1,4 +1,4 @@
-"""The members of a batch of runs with events: their states, and their results.
+"""The states and the results of runs with events, the members of a batch.
 
 Arrays have a leading axis of members. Runs by machine code have arrays of NumPy, whose rows change in place; the plain form has
 arrays of JAX for one member, which are replaced.
@@ -22,7 +22,7 @@ MemberIndices = Int[np.ndarray, "b"] | None  # the indices of members; None: all
 
 
 class RunState(NamedTuple):
-    """The states of runs: time, coordinates, velocities, phase, and the joints that events have added with all sides."""
+    """The states of runs: time, coordinates, velocities, phase, and the joints that events have added, followed by all sides."""
 
     t: Float[Any, "*m"]
     q: Float[Any, "*m n"]
@@ -31,13 +31,16 @@ class RunState(NamedTuple):
     joints: Any  # joints, with JAX arrays of one member; or NumPy arrays of the numbers of all members, changed in place
 
     def where(self, mask: Bool[np.ndarray, "m"]) -> "RunState":
-        """Return the masked states."""
+        """Return the states of the masked members; `joints` stay as they are."""
         t, q, v, phase, joints = self
         return RunState(t[mask], q[mask], v[mask], phase[mask], joints)
 
 
 class EventRun(NamedTuple):
-    """The outputs and events of a run, infinite if not reached. In tangents, fields without derivatives are None."""
+    """The outputs and events of a run; states and times that were not reached are infinite.
+
+    In the tangents of a run, fields without derivatives are None.
+    """
 
     q: Float[Any, "*m T n"]
     v: Float[Any, "*m T n"]
@@ -47,13 +50,13 @@ class EventRun(NamedTuple):
     event_v: Float[Any, "*m K 2 n"]
     event_index: Int[Any, "*m K"]  # index of the event; plus E if a contact opens, plus 2 E if it comes to rest
     event_phase: Bool[Any, "*m K C"]  # phase after the event
-    together: Bool[Any, "*m K"]  # whether it is simultaneous with the previous event, as one event
+    together: Bool[Any, "*m K"]  # whether it happens together with the previous event, as one
     closed: Int[Any, "*m K E"]  # the states of all contacts, as in `ContactChanges`
     sides: Float[Any, "*m K S"]  # the sides of comparisons after the event
-    count: Int[Any, "*m"]
-    unresolved: Float[Any, "*m E"]
-    undefined: Bool[Any, "*m E"]
-    code: Int[Any, "*m"]
+    count: Int[Any, "*m"]  # number of events
+    unresolved: Float[Any, "*m E"]  # as in `Events`
+    undefined: Bool[Any, "*m E"]  # as in `Events`
+    code: Int[Any, "*m"]  # the `Result`
     totals: Int[Any, "*m 5"]  # steps tried, accepted, right-hand sides, projections, implicit steps
     first_phase: Bool[Any, "*m C"]  # phase at the start
     first_sides: Float[Any, "*m S"]  # sides at the start
@@ -79,7 +82,7 @@ def shapes_of_run(plan: EventPlan, T: int, n: int, room: int) -> EventRun:
 
 
 class MemberRuns(NamedTuple):
-    """State of B runs that the loop over windows and events updates."""
+    """The state of B runs, which the loop over events updates."""
 
     t: Float[Any, "B"]
     q: Float[Any, "B n"]
@@ -109,7 +112,7 @@ class MemberRuns(NamedTuple):
         )
 
     def kink_count(self, plan: EventPlan, members: MemberIndices) -> Int[Any, "b"]:
-        """Return the number of kinks so far."""
+        """Return the number of kinks that members have recorded so far."""
         index = take(self.record[RECORD.index("event_index")], members)
         xp = np if isinstance(index, np.ndarray) else jnp
         if not plan.has_kinks:
@@ -117,7 +120,7 @@ class MemberRuns(NamedTuple):
         return xp.sum((index >= 0) & (index < plan.count) & xp.asarray(plan.kinks)[index % plan.count], axis=1)
 
     def put(self, members: MemberIndices, **new: Any) -> "MemberRuns":
-        """Return the runs with new values of members."""
+        """Return the runs with new values of the named fields for members; NumPy arrays change in place."""
         if members is None:
             return self._replace(**new)
         for name, x in new.items():
@@ -125,7 +128,7 @@ class MemberRuns(NamedTuple):
         return self
 
     def note(self, members: MemberIndices, rows: Int[Any, "b k"], *new: Any) -> "MemberRuns":
-        """Return the runs with new values of `RECORD`, each (b or 1, k or 1, ...), in `rows` of the record."""
+        """Return the runs with new entries in `rows` of the record: an array (b or 1, k or 1, ...) for each field of `RECORD`."""
         column = (np.arange(len(self.t)) if members is None else members)[:, None]
         if isinstance(self.t, np.ndarray):
             for array, x in zip(self.record, new, strict=True):
@@ -138,12 +141,12 @@ Change = Callable[[MemberRuns, MemberIndices], MemberRuns]
 
 
 def take(x: Any, members: MemberIndices) -> Any:
-    """Return the rows of members."""
+    """Return the rows of an array that belong to members."""
     return x if members is None else x[members]
 
 
 def runs_before(plan: EventPlan, state: RunState, T: int, code: Int[Any, "B"], xp: ModuleType, window: Any = None) -> MemberRuns:
-    """Return runs before their start, with the `Result` known so far."""
+    """Return B runs before their start, in the given states; `code` is the `Result` of each as far as it is known."""
     (B, n), E = state.q.shape, plan.count
     shapes = shapes_of_run(plan, T, n, plan.room + 1)._asdict()
     values = dict.fromkeys(EVENT_STATES, np.inf) | {

@@ -20,7 +20,7 @@ from udkjax.transforms.gradients import stop_gradients
 
 
 def modes_of(system: System, members: MemberIndices, at: RunState) -> FrictionModes:
-    """Return the modes of the joints of members."""
+    """Return the modes of the joints and contacts of members at states."""
     plan, sides = system.plan, system.sides(members, at.joints)
     direction, rest = (sides[..., plan.directions_of_sliding + k] for k in range(2))
     held = plan.held(at.phase, system.xp) & plan.impacts
@@ -47,14 +47,14 @@ def settle_friction(
     given: FrictionModes | None = None,
     resting: Bool[Any, "*m E"] | None = None,
 ) -> tuple[RunState, Int[Any, "*m"]]:
-    """Decide which joints stick, and in which direction the others slide.
+    """Decide which joints stick, and in which direction the others slide; return the states with these modes.
 
     Args:
         system: the system.
-        members: the members.
+        members: the indices of the members; None: all.
         at: their states, whose phases and sides have the modes of the joints before.
         stopped: the event of each member: of a joint that has stopped, or, plus E, of one that reaches its limit; -1: another.
-        given: the modes, if they are known.
+        given: the modes, if a run has decided already.
         resting: contacts that do not separate, which may be held or not; None: those that are held.
 
     Returns:
@@ -77,14 +77,14 @@ def settle_friction(
 
 
 def _with_locks(system: System, members: MemberIndices, at: RunState, new: Bool[Any, "*m F"]) -> RunState:
-    """Return the states with the locks of the masked joints at their places."""
+    """Return the states with the locks of the masked joints added at the present positions."""
     others = len(system.plan.added_by) - len(system.plan.sticking)
     new = system.xp.concatenate([system.xp.zeros((len(at.t), others), bool), new], axis=-1)
     return at._replace(joints=system.add_joints(members, new, at.q, at.joints))
 
 
 def begin_with_friction(system: System, runs: MemberRuns, members: MemberIndices) -> MemberRuns:
-    """Return the runs with the modes of all joints at their start."""
+    """Return the runs at their start, with the modes of the joints of members decided."""
     state, found = settle_friction(system, members, runs.state(members), take(runs.event, members) * 0 - 1)
     settles = found == Result.successful
     code = system.xp.where(settles, take(runs.code, members), found)
@@ -92,14 +92,17 @@ def begin_with_friction(system: System, runs: MemberRuns, members: MemberIndices
 
 
 class Rest(NamedTuple):
-    """The joints whose locks keep all joints at rest that are slow, and the velocities with these locks."""
+    """Modes in which locks keep all slow joints at rest, and the velocities that these locks allow."""
 
     modes: FrictionModes
     v: Any
 
 
 def _with_rest(system: System, members: MemberIndices, at: RunState, modes: FrictionModes) -> Rest:
-    """Return velocities at which locked joints are at rest: a stiff damper makes a force of the error of a speed that is zero."""
+    """Return the modes with velocities at which locked joints are at rest.
+
+    Otherwise a stiff damper would turn the error of a speed that should be zero into a force.
+    """
     xp = system.xp
     if xp is np and not modes.locked.any():
         return Rest(modes, at.v)
@@ -108,7 +111,7 @@ def _with_rest(system: System, members: MemberIndices, at: RunState, modes: Fric
 
 
 def _known_velocities(found: FrictionModes, rest: Rest | None, new: Bool[Any, "m F"]) -> Any:
-    """Return the velocities that the locks of modes allow, if they are known already; else None."""
+    """Return the velocities that the locks in `found` allow, if they are those of `rest`; None if they are not known yet."""
     if rest is None:
         return None
     same = (found.locked == rest.modes.locked).all(1) & (found.held == rest.modes.held).all(1)

@@ -1,4 +1,4 @@
-"""The interface of the loop to the motion: conditions at states, and the advance to the next crossing."""
+"""The interface between the loop and the motion: conditions at states, and the advance to the next crossing."""
 
 from collections.abc import Callable
 from types import ModuleType
@@ -14,13 +14,13 @@ from udkjax.transforms.gradients import stop_gradients
 
 
 class StateValues(NamedTuple):
-    """Conditions at states, their derivatives, and the directions of impulses along them."""
+    """The conditions of E events at states, their derivatives, and the directions of impulses along the conditions."""
 
-    a: Float[Any, "*m n"]
-    g: Float[Any, "*m E"]
-    rate: Float[Any, "*m E"]
-    rate_2: Float[Any, "*m E"]  # 0 for conditions that depend on velocities
-    by_t: Float[Any, "*m E"]
+    a: Float[Any, "*m n"]  # accelerations
+    g: Float[Any, "*m E"]  # values of the conditions
+    rate: Float[Any, "*m E"]  # first rates along the motion
+    rate_2: Float[Any, "*m E"]  # second rates; 0 for conditions that depend on velocities
+    by_t: Float[Any, "*m E"]  # partial derivatives with respect to t, q and v
     by_q: Float[Any, "*m E n"]
     by_v: Float[Any, "*m E n"]
     directions: Float[Any, "*m E n"]  # directions of impulses; arbitrary for events that are not impacts
@@ -35,7 +35,7 @@ class System(Protocol):
     Attributes:
         xp: jax.numpy, or NumPy.
         plan: the phases and events.
-        end: the last output times (B,).
+        end: the last output time of each member (B,).
         rate: characteristic rate of the system and the run (1/s) (B,).
         coordinates: the units of all coordinates (B, n).
         inverse_mass: one over the mass of each coordinate (B, n).
@@ -55,51 +55,52 @@ class System(Protocol):
     def look(
         self, members: MemberIndices, at: RunState, is_free: bool = False, is_directed: bool = False, has_forces: bool = False
     ) -> StateValues:
-        """Evaluate the conditions of members at states; if `is_free`, no contact is at rest, and no joint sticks.
+        """Return the values of the conditions of members at states.
 
-        Directions of impulses are evaluated if `is_free` or `is_directed`, forces if `has_forces`.
+        Directions of impulses are evaluated if `is_free` (the phases have no contact at rest and no joint that sticks) or
+        `is_directed`, forces if `has_forces`; fields that are not requested are arbitrary.
         """
         ...
 
     def project(
         self, members: MemberIndices, at: RunState, is_free: bool = False
     ) -> tuple[Float[Any, "b n"], Float[Any, "b n"], Float[Any, "b"]]:
-        """Return q and v projected to the constraints of their phases, and the largest remaining row of Psi_dot per scale."""
+        """Return q and v projected to the constraints of their phases, and the largest remaining |Psi_dot_i| over its scale."""
         ...
 
     def add_joints(self, members: MemberIndices, new: Bool[Any, "b A"], q: Float[Any, "b n"], joints: Any) -> Any:
-        """Return the joints that events have added, with new ones, added at q."""
+        """Return `joints` in which the joints that are masked in `new` are added at the positions q."""
         ...
 
     def advance(self, runs: MemberRuns, members: MemberIndices) -> MemberRuns:
-        """Advance members, at most to the next crossing, which becomes their `event`."""
+        """Return the runs with members advanced, at most to their next crossing, which becomes their `event`."""
         ...
 
     def sides(self, members: MemberIndices, joints: Any) -> Float[Any, "b S"]:
-        """Return the sides of the comparisons in forces (kinks.py): the last entry of `joints`."""
+        """Return all sides of members, of joints that may stick and of comparisons in forces (kinks.py), from `joints`."""
         ...
 
     def with_sides(self, members: MemberIndices, joints: Any, sides: Float[Any, "b S"]) -> Any:
-        """Return `joints` with other sides of the comparisons in forces of members."""
+        """Return `joints` with other sides of members."""
         ...
 
     def turned(self, members: MemberIndices, k: Int[Any, "b"], at: RunState) -> Float[Any, "b S"]:
-        """Return the sides of the comparisons in forces of members after event k at their states."""
+        """Return all sides of members after event k at their states."""
         ...
 
     def when(self, mask: Bool[Any, "B"], change: Change, runs: MemberRuns) -> MemberRuns:
-        """Return the runs with a change of the masked members."""
+        """Return the runs after `change(runs, members)` of the masked members."""
         ...
 
     def repeat(self, change: Callable[[MemberRuns], MemberRuns], runs: MemberRuns) -> MemberRuns:
-        """Return the runs after changing them until none is running."""
+        """Return the runs after repeating a change until none of them is running."""
         ...
 
 
 def condition_values(
     system: System, members: MemberIndices, state: RunState, is_directed: bool = False
 ) -> tuple[ConditionValues, StateValues]:
-    """Return the conditions of members at their states, and all quantities evaluated in these states."""
+    """Return the conditions of members at states with their scales, and all quantities that `System.look` evaluates there."""
     xp, state_values, unit = system.xp, system.look(members, state, is_directed=is_directed), take(system.coordinates, members)
     rate, t = take(system.rate, members)[:, None], state.t[:, None]
     by_q = xp.abs(state_values.by_q) * xp.maximum(unit, xp.abs(state.q))[:, None]

@@ -1,4 +1,4 @@
-"""Events as they are given: their conditions and actions, and the phases of a run that follow from them, without any state.
+"""The static side of events: their conditions and actions, and the phases of a run that follow from these, without any state.
 
 Everything here is known before a run begins; a new action or condition is added here, and `instant` applies it.
 """

@@ -1,4 +1,4 @@
-"""Actions: what an event does.
+"""Actions: the consequences of events.
 
 To add an action, write a class here (CONTRIBUTING.md). The plan of a run, its phases and pages use attributes and methods of
 `Action`, never the type of an action. If these cannot describe the effect, add an attribute, and use it in `jumps`: one that does
@@ -28,11 +28,12 @@ class Action(PrintsLine):
     """The base of all actions, which changes nothing about constraints or velocities.
 
     Attributes:
-        is_impact: whether it reverses the rate of its condition, which must fall to zero and depend on positions alone.
-        stops: whether it ends the run.
-        changes: whether it changes the motion; if not, contacts stay as they are.
-        adds: whether it adds a joint, its `addition`.
-        needs_joints: whether it changes joints, which a user-defined system lacks.
+        is_impact: whether the action reverses the rate of its event's condition, which must fall to zero and depend on positions
+            alone.
+        stops: whether the action ends the run.
+        changes: whether the action changes the motion; if not, contacts stay as they are.
+        adds: whether the action adds a joint, its `addition`.
+        needs_joints: whether the action changes joints, which a user-defined system lacks.
     """
 
     is_impact: ClassVar[bool] = False
@@ -43,22 +44,22 @@ class Action(PrintsLine):
 
     @property
     def rebound(self) -> Any:
-        """The ratio of the rebound speed to the approach speed."""
+        """The ratio of the rebound speed to the approach speed of an impact; 0 for other actions."""
         return 0.0
 
     @property
     def friction(self) -> Any:
-        """The coefficient of friction of an impact; None: it has no friction."""
+        """The coefficient of friction of an impact; None for an impact without friction, and for other actions."""
         return None
 
     @property
     def rest(self) -> Literal["", "hold", "stop"]:
-        """The consequence when an impact comes to rest: "hold" the contact, or "stop" the run."""
+        """The consequence when an impact comes to rest: "hold" the contact, or "stop" the run; "" for other actions."""
         return ""
 
     @property
     def turn(self) -> tuple[int, float, float] | None:
-        """The side of a comparison that it turns, the factor and the shift (kinks.py); None if it turns none."""
+        """The index of the side that the action turns, and factor and shift of `TurnSide` (kinks.py); None if it turns none."""
         return None
 
     @property
@@ -67,11 +68,14 @@ class Action(PrintsLine):
         return frozenset()
 
     def addition(self, mechanism: Mechanism, where: str) -> tuple[str, Joint] | None:
-        """Return the name of the joint that it adds, and the joint without the numbers that depend on the state at the event."""
+        """Return the name and the joint that the action adds; None if it adds none.
+
+        The joint lacks the numbers that depend on the state at the event. Error messages begin with `where`.
+        """
         return None
 
     def check(self, mechanism: Any, where: str):
-        """Return the name of the joint that the action adds, and the joint without numbers that follow from the state."""
+        """Raise an error, whose message begins with `where`, if the action does not fit the mechanism; by default it fits."""
 
     def has_usable_numbers(self) -> Bool[Array, ""]:
         """Return True if the numbers of the action, which may be traced, are within their limits."""
@@ -83,7 +87,7 @@ NUMBERS_OF_ACTIONS = ("rebound", "friction")
 
 
 def numbers_of_actions(actions: Sequence[Action], xp: ModuleType) -> Float[Any, "N E"]:
-    """Return the numbers of E actions, one row for each of `NUMBERS_OF_ACTIONS`."""
+    """Return the numbers of E actions (N, E), one row for each of the N names in `NUMBERS_OF_ACTIONS`."""
 
     def row(name: str) -> Any:
         values = [getattr(action, name) for action in actions]
@@ -188,12 +192,12 @@ class Release(Action):
 class Attach(Action):
     """Add a joint. Numbers that default to the initial guess are taken from the state at the event.
 
-    It replaces a joint of its name that events have added before. The name may be that of a joint of the scene which an event
-    releases: the added joint then takes its place. Velocities jump as in an inelastic impact: the smallest change in the metric
-    of M that the new constraints allow.
+    The new joint replaces a joint of the same name that events have added before. The name may be that of a joint of the scene
+    which an event releases: the added joint then takes its place. Velocities jump as in an inelastic impact: the smallest
+    change in the metric of M that the new constraints allow.
 
     Args:
-        joint: such as `Revolute(...)`.
+        joint: the joint to add, such as `Revolute(...)`.
         name: the name of the added joint.
     """
 
@@ -215,7 +219,7 @@ class Attach(Action):
 class Lock(Action):
     """Lock a revolute or prismatic joint, or the sliding of a slot, in its position at the event, as if by `Attach`.
 
-    Its constraint is named after the joint, with ".lock" appended: `Release("elbow.lock")` removes it again.
+    The added constraint is named after the joint, with ".lock" appended: `Release("elbow.lock")` removes it again.
 
     Args:
         joint: the name of a joint of the scene.

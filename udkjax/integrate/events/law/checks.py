@@ -21,7 +21,7 @@ def number_if_any(value: Any) -> Any:
 
 
 def require_vector(name: str, value: Any) -> None:
-    """Raise unless a point or a normal is two numbers, finite unless traced."""
+    """Raise an error unless a point or a normal is two numbers, which are traced or finite."""
     found = array(name, value)
     if found.shape != (2,):
         raise ValueError(f"{name} must be two numbers, x and y, not an array of the shape {found.shape}")
@@ -29,14 +29,14 @@ def require_vector(name: str, value: Any) -> None:
 
 
 def require_normal(name: str, value: Any) -> None:
-    """Raise `ValueError` if a normal is the zero vector; a traced one is not checked."""
+    """Raise an error unless a normal is two finite numbers, not both zero; values of traced numbers are not checked."""
     require_vector(name, value)
     if not isinstance(value, Tracer) and not np.any(np.asarray(value)):
         raise ValueError(f"{name} must not be zero: it points to the side that is allowed")
 
 
 def require_restitution(name: str, value: Any) -> None:
-    """Raise unless a restitution is one number from 0 to 1."""
+    """Raise an error unless a restitution is one number, traced or from 0 to 1."""
     require_number(name, value)
     if not isinstance(value, Tracer) and not 0 <= float(value) <= 1:
         raise ValueError(f"{name} must be from 0 to 1, not {float(value):g}")
@@ -57,7 +57,7 @@ def require_friction(where: str, coefficient: Any, static_coefficient: Any, at_r
 
 
 def require_limits(where: str, lower: Any, upper: Any) -> None:
-    """Raise if the limits of a joint's travel are not finite, missing or in the wrong order."""
+    """Raise an error if both limits of a joint's travel are missing, or they are not finite numbers in order, unless traced."""
     for name, limit in (("lower", lower), ("upper", upper)):
         if limit is not None:
             require_number(f"{where}: {name}", limit)
@@ -70,7 +70,7 @@ def require_limits(where: str, lower: Any, upper: Any) -> None:
 
 
 def require_joint(name: str, value: object) -> None:
-    """Raise unless the attached object is a joint of finite numbers."""
+    """Raise an error unless an object to attach is a joint with finite numbers."""
     if not isinstance(value, Joint):
         raise ArgumentTypeError(f"{name} must be a joint, such as udk.Weld(...), {describe(value)}")
     for leaf in jax.tree.leaves(value):

@@ -25,7 +25,7 @@ Coordinates = Array | np.ndarray | list[Any]
 
 
 def frames_of(names: Sequence[str], q: Coordinates, v: Coordinates | None = None) -> dict[str, Frame]:
-    """Return the frames of all bodies and the ground by name, from flat q and v; without v they have no velocities.
+    """Return the frames of all bodies and the ground by name, from flat q and v; if v is None, the frames have no velocities.
 
     While a program is traced, lists of numbers take half the time of arrays, whose entries are operations each.
     """
@@ -43,7 +43,7 @@ def _by_body(x: Coordinates, xp: ArrayLibrary) -> Any:
 
 @cache
 def probe_frames(names: tuple[str, ...], moving: bool = True) -> dict[str, Frame]:
-    """Return frames at an arbitrary concrete state, with or without velocities, to try conditions."""
+    """Return frames of bodies at an arbitrary concrete state, with velocities if `moving`, to try conditions."""
     probe = np.linspace(0.1, 0.9, 3 * len(names))
     return frames_of(names, probe, probe if moving else None)
 
@@ -63,13 +63,13 @@ class JointCoordinate(eqx.Module):
 
 
 class BodyCondition(eqx.Module):
-    """A condition that sees the frames of its `bodies` alone."""
+    """A condition that depends on time and on the frames of its `bodies` alone."""
 
     by_velocity: ClassVar[bool] = False  # whether it depends on velocities
 
     @abstractmethod
     def of_bodies(self, names: tuple[str, ...]) -> Self:
-        """Return the condition of bodies with other names."""
+        """Return the same condition, which knows its bodies by other names."""
 
     @abstractmethod
     def __call__(self, t: Number, frames: Frames) -> Number:
@@ -112,7 +112,7 @@ class Gap(BodyCondition):
 
 
 def joint_coordinate(mechanism: Mechanism, joint: str, where: str) -> JointCoordinate:
-    """Return the coordinate of a joint by its name. Raises ValueError with a message that begins with `where`."""
+    """Return the coordinate of a joint by its name; raise `ValueError`, whose message begins with `where`, if there is none."""
     require_name(joint, mechanism.joint_names, where, "joint")
     found = mechanism.joints[joint]
     if isinstance(found, Revolute):
@@ -124,7 +124,10 @@ def joint_coordinate(mechanism: Mechanism, joint: str, where: str) -> JointCoord
 
 
 def probe_arguments(model: Any, moving: bool = True) -> tuple[Any, ...]:
-    """Return arguments with which conditions can be tried: of a mechanism the frames, of a system q and v; v may be None."""
+    """Return the arguments after t, at an arbitrary state, with which conditions of a model can be tried.
+
+    These are (frames,) for a mechanism and (q, v) for a system. Unless `moving`, frames have no velocities, and v is None.
+    """
     if model.has_bodies:
         return (probe_frames(model.body_names, moving),)
     probe = np.linspace(0.1, 0.9, model.coordinate_count)
@@ -132,7 +135,7 @@ def probe_arguments(model: Any, moving: bool = True) -> tuple[Any, ...]:
 
 
 def sees_velocity(condition: Callable[..., Any], model: Any) -> bool:
-    """Return whether a condition depends on velocities: it then fails without them."""
+    """Return True if a condition depends on velocities: a trial without velocities then fails."""
     if isinstance(condition, BodyCondition):
         return condition.by_velocity
     try:
@@ -142,6 +145,6 @@ def sees_velocity(condition: Callable[..., Any], model: Any) -> bool:
 
 
 def require_name(name: str, known: Sequence[str], where: str, what: str) -> None:
-    """Raise ValueError unless a name is among the `known` ones."""
+    """Raise `ValueError` unless a name is among the `known` names; its message says "`where`: no `what` named ..."."""
     if name not in known:
         raise ValueError(f"{where}: no {what} named {quote(name)}{suggestion(name, known)}")

@@ -22,17 +22,23 @@ Cubic = tuple[Array, Array, Array, Array]  # value and slope at 0, value and slo
 
 
 class ConditionValues(NamedTuple):
-    """The conditions of events and their rates in a state."""
+    """The values of the conditions of E events at a state, and their rates along the motion."""
 
-    h: Float[Any, "*m E"]
-    rate: Float[Any, "*m E"]
-    rate_2: Float[Any, "*m E"]  # 0 for conditions that depend on velocities
-    a: Float[Any, "*m n"]
+    h: Float[Any, "*m E"]  # values
+    rate: Float[Any, "*m E"]  # first rates
+    rate_2: Float[Any, "*m E"]  # second rates; 0 for conditions that depend on velocities
+    a: Float[Any, "*m n"]  # accelerations
     scale: Float[Any, "*m E"]  # the change of a condition by a displacement of L, by a turn of one radian, or within T
 
 
 def zero_of(slides: Bool[np.ndarray, "E"], atol: Float[Any, "*b 1"], xp: ModuleType = jnp) -> Float[Any, "*b E"]:
-    """Return the bounds, relative to their scales, below which conditions count as zero; `slides` marks the speeds of joints."""
+    """Return the bounds, relative to the scales of conditions, below which conditions count as zero.
+
+    Args:
+        slides: mask of the conditions that are speeds of joints.
+        atol: absolute tolerance of each member, in units of the scene.
+        xp: jax.numpy, or NumPy.
+    """
     return xp.where(slides, xp.maximum(SLOW * atol, ZERO), ZERO)
 
 
@@ -41,7 +47,7 @@ def side_of_zero(values: ConditionValues, rate: Float[Any, "*m"], xp: ModuleType
 
     Args:
         values: the conditions and their rates.
-        rate: rate of the system (1/s).
+        rate: characteristic rate of the system (1/s).
         xp: jax.numpy, or NumPy.
     """
     h, dh, ddh, _, scale = values
@@ -58,10 +64,10 @@ def first_crossing(
     after: Int[Any, "*m C"],
     xp: ModuleType = jnp,
 ) -> Int[Any, "*m"]:
-    """Return the first event whose condition changes its side of zero, or `NO_EVENT`.
+    """Return the index of the first event, in the order of events, whose condition changes its side of zero; else `NO_EVENT`.
 
     Args:
-        direction: direction of the crossings of interest.
+        direction: direction in which each condition has to cross zero; 0: either.
         watched: mask of the watched conditions.
         before: the sides of zero before.
         after: the sides of zero now.
@@ -72,12 +78,12 @@ def first_crossing(
 
 
 def crosses(direction: Int[np.ndarray, "C"], before: Int[Array, "*G C"], after: Int[Array, "*G C"]) -> Bool[Array, "*G C"]:
-    """Return a mask of the conditions that cross zero in the given direction, 0 for either."""
+    """Return a mask of the conditions that cross zero, by their sides before and after, in their `direction` (0: either)."""
     return (before != 0) & (after == -before) & ((direction == 0) | (after == direction))
 
 
 def carry_signs(first: Int[Any, "E"], signs: Int[Any, "G E"], xp: ModuleType = jnp) -> Int[Any, "G E"]:
-    """Replace zeros in signs along a grid by the last nonzero sign."""
+    """Return signs along a grid, each zero replaced by the last nonzero sign before; `first` are the signs before the grid."""
     last = xp.where(signs != 0, np.arange(1, len(signs) + 1)[:, None], 0)
     last = np.maximum.accumulate(last, axis=0) if xp is np else jax.lax.cummax(last, axis=0)
     return xp.take_along_axis(xp.concatenate([first[None], signs]), last, axis=0)
@@ -96,7 +102,7 @@ def cubic_slope(cubic: Cubic, x: Array) -> Array:
 
 
 def cubic_root(cubic: Cubic, side: Any, xp: ModuleType = jnp) -> Any:
-    """Return the zero of a cubic that is on `side` of zero at 0, and beyond it at 1."""
+    """Return the zero in [0, 1] of Hermite's cubic that is on `side` (-1 or 1) of zero at 0, and on the other side at 1."""
     low, width, places = xp.zeros_like(cubic[0]), 1.0, np.arange(1, PARTS)
     for _ in range(DIVISIONS):
         width /= PARTS

@@ -45,7 +45,7 @@ from udkjax.wording import quote, suggestion
 
 
 class Event(PrintsLine):
-    """An `action` that happens when `condition(t, frames)`, a scalar, crosses zero; of a system, `condition(t, q, v)`.
+    """An `action` that happens where a scalar `condition` crosses zero along the motion.
 
     `frames` maps the name of each body, and "ground", to its frame: x, y, angle, cos, sin, vx, vy, omega, `point`, `velocity`.
     `direction` is 1 for rising, -1 for falling, 0 for either; for an `Impact`, whose condition is positive before the
@@ -53,9 +53,9 @@ class Event(PrintsLine):
     cross it. But an `Impact` whose condition is zero at the start, and falling, happens at once.
 
     Args:
-        condition: (t, frames) -> a number; for a `ConstrainedSystem`, (t, q, v) -> a number.
+        condition: a function (t, frames) -> number of a mechanism, or (t, q, v) -> number of a `ConstrainedSystem`.
         action: consequence of the event: `Stop`, `Log`, `Impact`, `Release`, `Attach` or `Lock`.
-        direction: 1: where it rises; -1: where it falls; 0: both.
+        direction: 1: where the condition rises; -1: where it falls; 0: both.
         name: name in lists.
     """
 
@@ -65,7 +65,7 @@ class Event(PrintsLine):
     name: str = eqx.field(static=True, default="")
 
     def expand(self, mechanism: Any) -> list["Event"]:
-        """Return this event as a list; ready-made events may expand to several."""
+        """Return this event as a list; ready-made objects such as `JointLimit` may expand to several events."""
         return [self]
 
 
@@ -77,8 +77,8 @@ class JointLimit(PrintsLine):
 
     Args:
         joint: the name of a revolute or prismatic joint, or of a slot.
-        lower: lower end of travel (rad, m), or None.
-        upper: upper end of travel (rad, m), or None.
+        lower: lower end of travel (rad, m); None: no limit.
+        upper: upper end of travel (rad, m); None: no limit.
         restitution: ratio of the rebound speed to the approach speed, 0 to 1.
         at_rest: "hold": rest in contact; "stop": end the run.
         name: name in lists; by default that of the joint.
@@ -92,7 +92,7 @@ class JointLimit(PrintsLine):
     name: str = eqx.field(static=True, default="")
 
     def expand(self, mechanism: Mechanism) -> list[Event]:
-        """Return one event for each limit."""
+        """Return one event for each limit that is given."""
         require_text("JointLimit: joint", self.joint)
         require_text("JointLimit: name", self.name, may_be_empty=True)
         name, found = self.name or self.joint, []
@@ -107,7 +107,7 @@ class JointLimit(PrintsLine):
 
 
 class Contact(PrintsLine):
-    """A point of a body hits a line fixed to the ground or to another body, and cannot pass it: an `Impact`.
+    """A point of a body that cannot pass a line, fixed to the ground or to another body: an `Impact` where it hits the line.
 
     The line goes through the point `through` of the body `on`; the `normal`, of any length, points to the allowed side. Both
     are in that body's own frame (m).
@@ -142,7 +142,7 @@ class Contact(PrintsLine):
     static_coefficient: Float[Array, ""] | None = eqx.field(converter=number_if_any, default=None)
 
     def expand(self, mechanism: Mechanism) -> list[Event]:
-        """Return the event, as a list."""
+        """Return the event of the contact as a list of one."""
         for argument, text in (("body", self.body), ("on", self.on), ("name", self.name)):
             require_text(f"Contact: {argument}", text, may_be_empty=argument == "name")
         name = self.name or f"{self.body} on {self.on}"
@@ -170,12 +170,12 @@ class Events(PrintsTable):
 
     Attributes:
         time: time of each event (s).
-        q_before: positions right before it.
-        v_before: velocities right before it.
-        q_after: positions right after it.
-        v_after: velocities right after it.
+        q_before: coordinates right before each event.
+        v_before: velocities right before each event.
+        q_after: coordinates right after each event.
+        v_after: velocities right after each event.
         count: number of events.
-        names: the names of the events; "" where none can happen.
+        names: the names of all events that may happen; "" for an index without such an event.
     """
 
     time: Float[Array, "events"]
@@ -200,7 +200,7 @@ class Events(PrintsTable):
         return PrintedTable(f"events: {int(self.count)}", [(f"{t:.9g} s", self.names[k]) for t, k in listed])
 
     def of(self, name: str) -> Float[Array, "k"]:
-        """Return the times (s) of the events with a name, in a single run."""
+        """Return the times (s) of the events with this name, in a single run (not a batch)."""
         require_name(name, [x for x in self.names if x], "events", "event")
         return self.time[np.asarray(self.index) == self.names.index(name)]
 
@@ -211,15 +211,15 @@ class Events(PrintsTable):
 
     @property
     def counts(self) -> dict[str, Int[Array, ""]]:
-        """The number of events of each name."""
+        """The number of events by name."""
         return {name: (self.index == k).sum(-1) for k, name in enumerate(self.names) if name}
 
 
 class ExpandsToEvents(Protocol):
-    """An `Event`, or an object that expands to several events."""
+    """An `Event`, or an object such as `JointLimit` that expands to one or several events."""
 
     def expand(self, mechanism: Mechanism) -> list[Event]:
-        """Return the events, for a mechanism."""
+        """Return the events for a mechanism."""
         ...
 
 
@@ -227,7 +227,10 @@ EventsLike: TypeAlias = ExpandsToEvents | Sequence[ExpandsToEvents] | Mapping[st
 
 
 def listed_events(events: EventsLike) -> tuple[ExpandsToEvents, ...]:
-    """Return an event, a list of events, or events by name as a tuple. Raises `ValueError`."""
+    """Return one event, a sequence of events, or events by name as a tuple; the keys of a mapping become the names of its events.
+
+    Raise `ValueError` if a value of a mapping is not an event.
+    """
     if isinstance(events, Mapping):
         return tuple(_called(event, name) for name, event in events.items())
     return tuple(events) if isinstance(events, Sequence) else (events,)
@@ -247,7 +250,7 @@ def _expected(event: Any) -> str:
 
 
 def expand_events(events: Sequence[ExpandsToEvents], mechanism: Any) -> tuple[Event, ...]:
-    """Return all events with unique names. Raises `ValueError` if one is invalid."""
+    """Return all events to which the given ones expand, with unique names; raise `ValueError` if one is invalid or none given."""
     found: list[Event] = []
     for k, event in enumerate(events):
         try:
@@ -279,9 +282,9 @@ def _expand(event: ExpandsToEvents, k: int, mechanism: Any, found: list[Event]) 
 
 
 def has_usable_numbers(events: Sequence[Event]) -> Bool[Array, ""]:
-    """Tell whether the numbers of events are valid: restitutions from 0 to 1, limits in order, contacts finite.
+    """Return True if the numbers of events are valid: restitutions from 0 to 1, limits in order, numbers of contacts finite.
 
-    Concrete numbers were checked before; this checks traced ones.
+    This is for traced numbers; concrete numbers are checked when events are expanded.
     """
     are_usable, limits = jnp.array(True), {}
     for e in events:

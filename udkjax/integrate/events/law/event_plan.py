@@ -1,4 +1,4 @@
-"""The static part of runs with events: the phases to which events lead, and masks of the kinds of events."""
+"""The static part of runs with events: the phases to which events lead, and masks of kinds of events."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -23,13 +23,13 @@ class EventPlan:
     """The part of a run's events and phases that does not depend on numbers; runs with equal plans share their code."""
 
     switches: Switches
-    directions: tuple[int, ...]  # for each event
-    by_velocity: tuple[bool, ...]  # whether its condition depends on velocities
+    directions: tuple[int, ...]  # of each event
+    by_velocity: tuple[bool, ...]  # whether the condition of each event depends on velocities
     actions: tuple[type[Action], ...]
-    at_rest: tuple[str, ...]  # consequence of rest, for impacts
+    at_rest: tuple[str, ...]  # `Action.rest` of each event
     max_steps: int
     max_events: int  # without kinks
-    turns: tuple[tuple[int, float, float] | None, ...]  # the side that it turns, with factor and shift
+    turns: tuple[tuple[int, float, float] | None, ...]  # `Action.turn` of each event
     side_count: int  # the number S of sides
     added_by: tuple[int, ...]  # for each joint that events add, its event; the last ones are the locks of joints that stick
     sticking: tuple[StickingJoint, ...]  # the joints that may stick, F
@@ -47,7 +47,7 @@ class EventPlan:
 
     @cached_property
     def side_changes(self) -> Float[np.ndarray, "2 2E S"]:
-        """The factor and the shift of each side at an event, or where its contact opens, which turns none."""
+        """The factors and the shifts of all sides at each event, then where its contact opens (factor 1, shift 0)."""
         changes = np.stack([np.ones((2 * self.count, self.side_count)), np.zeros((2 * self.count, self.side_count))])
         for k, turn in enumerate(self.turns):
             if turn is not None:
@@ -56,7 +56,7 @@ class EventPlan:
 
     @property
     def first_kink_side(self) -> int:
-        """The number of sides that do not belong to kinks, which come first."""
+        """The index of the first side of a kink; the sides before belong to joints that may stick."""
         return SIDES * len(self.sticking)
 
     @property
@@ -66,7 +66,7 @@ class EventPlan:
 
     @property
     def room(self) -> int:
-        """Largest number of recorded events: `max_events`, plus `MOST_KINKS` if forces have kinks."""
+        """The largest number of recorded events: `max_events`, plus `MOST_KINKS` if forces have kinks."""
         return self.max_events + (MOST_KINKS if self.has_kinks else 0)
 
     @property
@@ -76,7 +76,7 @@ class EventPlan:
 
     @cached_property
     def both_directions(self) -> Int[np.ndarray, "2E"]:
-        """The directions in which zeros count: of conditions, then of forces, which fall below zero."""
+        """The directions in which zeros are events: of all conditions, then of all forces (-1, where they fall below zero)."""
         return np.array([*self.directions, *[-1] * self.count])
 
     @cached_property
@@ -106,12 +106,12 @@ class EventPlan:
 
     @cached_property
     def held_at_rest(self) -> Bool[np.ndarray, "E"]:
-        """Mask of the impacts that are held where they come to rest."""
+        """Mask of the events whose contacts are held where they come to rest."""
         return np.array([x == "hold" for x in self.at_rest])
 
     @cached_property
     def stops_at_rest(self) -> Bool[np.ndarray, "E"]:
-        """Mask of the impacts that end the run where they come to rest."""
+        """Mask of the events that end the run where their contacts come to rest."""
         return np.array([x == "stop" for x in self.at_rest])
 
     # Phases are masks of the switches (*m, C).
@@ -123,12 +123,12 @@ class EventPlan:
 
     @cached_property
     def _changes(self) -> Bool[np.ndarray, "2 E C"]:
-        """The switches that an event turns off, and those that it turns on."""
+        """Masks of the switches that each event turns off, and of those that it turns on."""
         return np.array([self.switches.removed, self.switches.added], bool).reshape(2, self.count, len(self.first))
 
     @cached_property
     def _contacts(self) -> Bool[np.ndarray, "E C"]:
-        """The switch of each contact that may be held, and of each joint that may stick."""
+        """Mask of the switch that holds the contact, or locks the joint, of each event; no switch for other events."""
         return np.array(self.switches.contacts, int)[:, None] == np.arange(len(self.first))
 
     @cached_property
@@ -144,12 +144,12 @@ class EventPlan:
 
     @cached_property
     def slides(self) -> Bool[np.ndarray, "E"]:
-        """Mask of the events of joints that may stick."""
+        """Mask of the events of sliding, two for each joint that may stick."""
         return np.isin(np.arange(self.count), [x.events for x in self.sticking])
 
     @cached_property
     def forwards(self) -> Int[np.ndarray, "F"]:
-        """Index of the event at which each joint slides in the positive direction; that of the negative direction is the next."""
+        """Index of the event of sliding in the positive direction of each joint; that of the negative direction is the next."""
         return np.array([x.event for x in self.sticking], int)
 
     @cached_property
@@ -164,7 +164,7 @@ class EventPlan:
 
     @cached_property
     def tangents(self) -> Int[np.ndarray, "E"]:
-        """The event of sliding in the positive direction of each contact with friction; -1 for all other events."""
+        """Index of the event of sliding in the positive direction, for each event that is a contact with friction; else -1."""
         found = np.full(self.count, -1)
         for x in self.sticking:
             if x.contact >= 0:
@@ -183,7 +183,7 @@ class EventPlan:
 
     @cached_property
     def locks(self) -> Int[np.ndarray, "F"]:
-        """The switch of each joint by which it sticks."""
+        """Index of the switch by which each joint sticks."""
         return np.array(self.switches.contacts, int)[self.forwards]
 
     @cached_property
@@ -195,7 +195,7 @@ class EventPlan:
         return phase[..., self.locks]
 
     def with_locks(self, phase: Bool[Any, "*m C"], locked: Bool[Any, "*m F"], xp: ModuleType) -> Bool[Any, "*m C"]:
-        """Return a phase in which the masked joints stick, and no others."""
+        """Return the phase with exactly the masked joints stuck."""
         return (phase & ~self._switches_of_locks) | xp.any(locked[..., None] & self._pairs_of_locks, axis=-2)
 
     @cached_property
@@ -203,7 +203,10 @@ class EventPlan:
         return self.locks[:, None] == np.arange(len(self.first))
 
     def not_sliding(self, sides: Float[Any, "*m S"], xp: ModuleType) -> Bool[Any, "*m E"]:
-        """Return a mask of the directions that do not count: joints do not slide in them, and do not wait for their drivers."""
+        """Return a mask of the events of sliding whose joint neither slides in their direction nor waits for drivers.
+
+        The conditions of these events are not watched.
+        """
         direction, at_rest = (sides[..., self.directions_of_sliding + k] for k in range(2))
         either = [((direction * sign < 0.5) | (at_rest > 0.5)) & (at_rest < 1.5) for sign in (1, -1)]
         position, is_backwards = self._joints_of_slides
@@ -211,18 +214,18 @@ class EventPlan:
 
     @cached_property
     def _joints_of_slides(self) -> tuple[Int[np.ndarray, "E"], Bool[np.ndarray, "E"]]:
-        """The joint of each event that may stick, and whether its direction of sliding is negative."""
+        """Index of the joint of each event of sliding, and a mask of the negative direction; 0 and False for other events."""
         position, own = np.zeros((2, self.count), int)
         position[self.forwards], position[self.forwards + 1] = np.arange(len(self.forwards)), np.arange(len(self.forwards))
         own[self.forwards + 1] = 1
         return position, own == 1
 
     def is_first(self, phase: Bool[Any, "*m C"]) -> Bool[Any, "*m"]:
-        """Return whether a phase is that in which runs begin."""
+        """Return a mask of the members whose phase is that in which runs begin."""
         return (phase == self.first).all(axis=-1)
 
     def held(self, phase: Bool[Any, "*m C"], xp: ModuleType) -> Bool[Any, "*m E"]:
-        """Return a mask of the contacts at rest, and of the joints that stick, in a phase."""
+        """Return a mask of the events whose contact rests, or whose joint sticks, in a phase."""
         if xp is np and not phase[..., self._switches_of_contacts].any():  # the usual case
             return np.zeros((*phase.shape[:-1], self.count), bool)
         return xp.any(phase[..., None, :] & self._contacts, axis=-1)
@@ -233,20 +236,23 @@ class EventPlan:
         return (phase & ~off) | on
 
     def free(self, phase: Bool[Any, "*m C"]) -> Bool[Any, "*m C"]:
-        """Return the phase that follows when all contacts at rest open, and all joints that stick slide."""
+        """Return the phase with all contacts at rest opened, and all sticking joints released."""
         return phase & ~self._switches_of_contacts
 
     def without_contacts(self, phase: Bool[Any, "*m C"]) -> Bool[Any, "*m C"]:
-        """Return the phase that follows when all contacts at rest open."""
+        """Return the phase with all contacts at rest opened."""
         of_joints = np.isin(np.arange(len(self.first)), self.locks[self.contacts_that_rub < 0])
         return phase & ~(self._switches_of_contacts & ~of_joints)
 
     def with_contacts(self, phase: Bool[Any, "*m C"], held: Bool[Any, "*m E"], xp: ModuleType) -> Bool[Any, "*m C"]:
-        """Return the phase that follows when contacts come to rest, or joints stick."""
+        """Return the phase in which, in addition, the contacts or joints of the masked events are held."""
         return phase | xp.any(held[..., None] & self._contacts, axis=-2)
 
     def watched(self, phase: Bool[Any, "*m C"], carried: Bool[Any, "*m E"], xp: ModuleType) -> Bool[Any, "*m 2E"]:
-        """Return a mask of the conditions, and of the forces, that count."""
+        """Return a mask of the watched conditions, then of the watched forces.
+
+        A condition is watched unless it is held or `carried`; a force is watched while it holds.
+        """
         held = self.held(phase, xp)
         return xp.concatenate([~held & ~carried, held], axis=-1)
 
@@ -254,14 +260,14 @@ class EventPlan:
 def event_plan(
     phases: Phases, events: Sequence[Event], max_steps: int, max_events: int, by_velocity: tuple[bool, ...] | None = None
 ) -> EventPlan:
-    """Return the plan of a run.
+    """Return the plan of runs with these phases and events.
 
     Args:
         phases: the phases.
         events: all events.
         max_steps: the largest number of steps that are tried.
         max_events: the largest number of events.
-        by_velocity: mask of the conditions that depend on velocities; None: they are tried.
+        by_velocity: mask of the conditions that depend on velocities; None: a trial of each condition shows this.
     """
     if by_velocity is None:
         by_velocity = tuple(sees_velocity(e.condition, phases.mechanisms[SCENE]) for e in events)

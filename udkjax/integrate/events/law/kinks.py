@@ -1,8 +1,9 @@
 """Jumps and kinks of forces that the state decides, as events of their own: a step ends there, and derivatives pass through.
 
 A force with comparisons of the state becomes a `HeldForce`: the sides of its comparisons are numbers, with which its loads are
-smooth, also beyond the crossing (expressions/scalars/kinks.py). Where a condition falls through zero, its side turns. The loads
-of a user-defined system are held in the same way, all together: the sides are the last of its numbers.
+smooth, also beyond the crossing (expressions/scalars/kinks.py). Where the condition of a comparison falls through zero, its side
+turns: it takes another value. The loads of a user-defined system are held in the same way, all together: the sides are the last
+of its numbers.
 """
 
 from collections.abc import Iterator, Sequence
@@ -31,9 +32,9 @@ MOST_KINKS = 256  # of a run; then sides are no longer held, as a run at rest wh
 
 
 class HeldForce(ForceElement):
-    """A force element whose comparisons of the state have given sides."""
+    """A force element with given sides of its comparisons of the state."""
 
-    element: Any
+    element: Any  # the original element
     sides: Float[Array, "k"]
     smooth: SmoothLoads = eqx.field(static=True)
 
@@ -48,13 +49,13 @@ class HeldForce(ForceElement):
 
 
 class Kink(eqx.Module):
-    """The condition under which a comparison keeps its side: positive, and falling where it changes."""
+    """The condition under which a comparison in a force keeps its side: positive, falling through zero where the side turns."""
 
     bodies: tuple[str, ...] | None = eqx.field(static=True)  # None: of a system, whose conditions see q and v
-    element: Any  # or the numbers of a system
+    element: Any  # the force element, or the numbers of a system
     sides: Float[Array, "k"]
     smooth: SmoothLoads = eqx.field(static=True)
-    index: int = eqx.field(static=True)
+    index: int = eqx.field(static=True)  # of the condition in `smooth`
 
     def __call__(self, t, *state):
         if self.bodies is None:
@@ -69,7 +70,7 @@ class Kink(eqx.Module):
 
 
 class TurnSide(Action):
-    """Turn a side: the number `side` of all sides becomes `factor` times itself plus `shift`."""
+    """The action that turns a side: the one of index `side` among all sides becomes `factor` times itself plus `shift`."""
 
     side: int = eqx.field(static=True)
     factor: float = eqx.field(static=True)
@@ -83,12 +84,12 @@ class TurnSide(Action):
 
 
 class HeldElement(NamedTuple):
-    """Loads with held sides, of a force element or of a system; hashable."""
+    """The static description of loads with held sides, of a force element or of a system; hashable."""
 
     force: int | None  # index of the element among the forces of a mechanism; None for the loads of a system
     smooth: SmoothLoads
     coordinates: tuple[int, ...]  # indices of the coordinates on which the loads may depend
-    first: int  # index of its first side
+    first: int  # index of its first side among all sides
     event: int  # index of the first of its events, counted from the first kink
 
     @property
@@ -96,13 +97,13 @@ class HeldElement(NamedTuple):
         return slice(self.first, self.first + self.smooth.count)
 
     def renewed(self, numbers: Sequence[Any], t: Any, q: Any, v: Any, sides: Any) -> list[Any]:
-        """Return the inputs of `smooth.renewal` at a state with all coordinates."""
+        """Return the inputs of `smooth.renewal`, from numbers and `sides` of the loads, and the state of the whole mechanism."""
         at = np.array(self.coordinates, int)
         return self.smooth.inputs(numbers, t, q[at], v[at], sides)
 
 
 def with_sides(events: Sequence[Event], sides: Float[Array, "S"], held: Sequence[HeldElement]) -> tuple[Event, ...]:
-    """Return events with the sides in the conditions of kinks, the last events."""
+    """Return the events with all `sides` put into the conditions of kinks, which are the last events."""
     result, first = list(events), len(events) - sum(len(x.smooth.turns) for x in held)
     for element in held:
         for k in range(first + element.event, first + element.event + len(element.smooth.turns)):
@@ -111,7 +112,7 @@ def with_sides(events: Sequence[Event], sides: Float[Array, "S"], held: Sequence
 
 
 class FoundKinks(NamedTuple):
-    """The kinks of forces, as far as they are known before a run."""
+    """The forces of a model with kinks, as far as they are known before a run."""
 
     held: tuple[str, ...]  # forces, or functions of a system, with kinks that can be located
     others: tuple[str, ...]  # forces, or functions of a system, with kinks that cannot
@@ -122,7 +123,11 @@ class FoundKinks(NamedTuple):
         return bool(self.held)
 
     def remark(self, by_steps: str) -> str:
-        """Return whether kinks are located, as text; empty without any. A run `by_steps` locates none."""
+        """Return a remark whether kinks are located; "" if there are none.
+
+        Args:
+            by_steps: the reason why a run locates no kinks, such as "with a progress meter"; "" if it locates them.
+        """
         if by_steps and (self.are_held or self.others):
             return f"not located {by_steps}"
         unseen = f"not located in {', '.join(map(quote, self.others))}" if self.others else ""
@@ -130,7 +135,7 @@ class FoundKinks(NamedTuple):
 
 
 def kinks_of(model: Any) -> FoundKinks:
-    """Return which forces of a mechanism, or which functions of a system, have jumps or kinks that the state decides."""
+    """Return the forces of a mechanism, or the functions of a system, that have jumps or kinks which the state decides."""
     if not model.has_bodies:
         return _kinks_of_functions(model.functions, model.breakpoints is not None)
     return (_concrete_kinks if model.is_concrete else _kinks)(model)
@@ -159,7 +164,7 @@ _concrete_kinks = cached_by_identity(_kinks)
 
 
 def _smooth_forces(mechanism: Mechanism) -> Iterator[tuple[str, SmoothLoads, bool]]:
-    """Return for each force that may have kinks its name, its smooth loads, and whether its sides can be held."""
+    """Yield, for each force that may have kinks, its name, its smooth loads, and whether its sides can be held."""
     sampled = {k for section, k, _ in mechanism.samples if section == "_forces"}
     rows = mechanism.without_samples._forces if sampled else mechanism._forces
     for k, (name, element) in enumerate(mechanism.forces.items()):
@@ -170,9 +175,9 @@ def _smooth_forces(mechanism: Mechanism) -> Iterator[tuple[str, SmoothLoads, boo
 
 
 def with_held_forces(model: Any, first: int = 0) -> tuple[Any, tuple[HeldElement, ...], tuple[Event, ...]]:
-    """Return a model with held loads, the held elements, and the events at which their sides change; itself without kinks.
+    """Return a model with held loads, the held elements, and the events at which their sides turn.
 
-    `first` is the number of other sides, which come first.
+    A model without kinks is returned with two empty tuples. `first` is the number of other sides, which come first.
     """
     return _with_held_elements(model, first) if model.has_bodies else _with_held_loads(model)
 
@@ -191,7 +196,7 @@ def _with_held_loads(system: Any) -> tuple[Any, tuple[HeldElement, ...], tuple[E
 
 
 def _turn(condition: Kink, first: int, index: int, name: str) -> Event:
-    """Return the event at which a side turns."""
+    """Return the event at which the condition with this index turns a side of the force `name`, whose first side is `first`."""
     side, factor, shift = condition.smooth.turns[index]
     return Event(condition, TurnSide(first + side, factor, shift), -1, f"kink {index + 1} of {name}")
 
@@ -219,17 +224,17 @@ def _with_held_elements(mechanism: Mechanism, first: int) -> tuple[Mechanism, tu
 
 
 def sides_in(model: Any, force: int | None) -> Float[Array, "k"]:
-    """Return the sides of a force of a mechanism, or of the loads of a system."""
+    """Return the sides of the force with the index `force` of a mechanism, or, if it is None, of the loads of a system."""
     return model.numbers[-1] if force is None else model._forces[force].sides
 
 
 def has_sides(model: Any, force: int | None) -> bool:
-    """Return whether a model has the force: the mechanism of the scene lacks the friction of contacts."""
+    """Return True if a model has the force with this index: the mechanism of the scene lacks the friction of contacts."""
     return force is None or force < len(model._forces)
 
 
 def renewed_sides(elements: Sequence[HeldElement], model: Any, t: Any, q: Any, v: Any, sides: Any) -> Array:
-    """Return all sides at a state, with those of kinks that are not known yet or depend on others."""
+    """Return all sides at a state; sides of kinks that are unknown (FREE), or depend on others, are determined from the state."""
     if not elements:
         return sides
     result = list(sides[: elements[0].first])
@@ -242,8 +247,8 @@ def renewed_sides(elements: Sequence[HeldElement], model: Any, t: Any, q: Any, v
 class KinkPlaces(NamedTuple):
     """Indices of the numbers of kinks among the numbers of all events."""
 
-    sides: tuple[tuple[int, int], ...]  # each with the index of its side
-    elements: tuple[tuple[int, ...], ...]  # of the numbers of each force, without sides
+    sides: tuple[tuple[int, int], ...]  # place of each number that is a side, with the index of the side
+    elements: tuple[tuple[int, ...], ...]  # places of the numbers of each held force, without sides
 
 
 def places_of_kinks(events: Sequence[Event], held: Sequence[HeldElement]) -> KinkPlaces:

@@ -41,11 +41,11 @@ class Switches(NamedTuple):
     first: tuple[bool, ...] = ()  # the phase in which a run begins: constraints of the scene are on, all others are off
     removed: tuple[tuple[bool, ...], ...] = ()  # (E, C)
     added: tuple[tuple[bool, ...], ...] = ()  # (E, C)
-    contacts: tuple[int, ...] = ()  # the switch that holds the contact, or the joint that may stick, of an event; -1: none
-    rows: tuple[int, ...] = ()  # the row of Psi of that switch; -1: none
-    joint_rows: tuple[tuple[int, ...], ...] = ()  # the rows of the joint that this switch locks; empty: it locks none
-    switch_of_row: tuple[int, ...] = ()  # -1: a row of the scene that no event changes
-    redundant: tuple[bool, ...] = ()  # rows of the scene that depend on others while all constraints of the scene hold
+    contacts: tuple[int, ...] = ()  # (E,): the switch that holds the contact, or the joint that may stick, of an event; -1: none
+    rows: tuple[int, ...] = ()  # (E,): the row of Psi of that switch; -1: none
+    joint_rows: tuple[tuple[int, ...], ...] = ()  # (E,): the rows of the joint that this switch locks; empty: it locks none
+    switch_of_row: tuple[int, ...] = ()  # (m,): the switch of each row of Psi; -1: a row of the scene that no event changes
+    redundant: tuple[bool, ...] = ()  # (m,): rows of the scene that depend on others while all constraints of the scene hold
 
     def on(self, phase: Bool[Any, "*m C"]) -> Bool[Any, "*m m"]:
         """Return a mask of the rows of Psi that hold in a phase."""
@@ -59,7 +59,7 @@ class Switches(NamedTuple):
 
 
 class Phases(eqx.Module):
-    """The mechanism of the scene, and the one with all switches if there are any; their analyses, and the switches."""
+    """The mechanism of the scene, and the mechanism with all switches if there are any; their analyses, and the switches."""
 
     mechanisms: tuple[Any, ...]  # mechanisms, or one traced system
     analyses: tuple[Analysis | None, ...]
@@ -71,16 +71,16 @@ class Phases(eqx.Module):
 
     @property
     def sided(self) -> tuple[StickingJoint | HeldElement, ...]:
-        """All forces with sides, in the order of the sides."""
+        """All joints that may stick and forces with held sides, in the order of their sides."""
         return (*self.sticking, *self.held)
 
     def mechanism(self, which: int, phase: Bool[Array, "C"], added: Added) -> Any:
         """Return the mechanism of a phase, with the joints that events have added and the sides of its comparisons.
 
         Args:
-            which: SCENE, in the phase in which a run begins, or SWITCHED.
-            phase: the phase.
-            added: the joints and the sides.
+            which: SCENE (only for the phase in which a run begins) or SWITCHED.
+            phase: the phase, a mask of switches.
+            added: the joints that events have added, then all sides.
         """
         mechanism, (*joints, sides) = self.mechanisms[which], added
         for sided in self.sided:
@@ -99,7 +99,7 @@ class Phases(eqx.Module):
         return tuple(self.joint_at(k, self.mechanisms[SCENE].q0.ravel()) for k in range(len(self.added)))
 
     def with_kinks(self, model: Any, held: tuple[HeldElement, ...], count: int) -> "Phases":
-        """Return the phases with the loads of a model some of which are held, and with events at `count` kinks."""
+        """Return the phases with the held loads of a model, and with `count` further events, those at kinks."""
         switches, none = self.switches, (False,) * len(self.switches.names)
         more = {name: (*getattr(switches, name), *[none] * count) for name in ("removed", "added")}
         more |= {name: (*getattr(switches, name), *[-1] * count) for name in ("contacts", "rows")}
@@ -112,13 +112,13 @@ class Phases(eqx.Module):
         return eqx.tree_at(lambda p: [m._forces[k] for m in p.mechanisms for k in places], found, forces)
 
     def joint_at(self, k: int, q: Array) -> Joint:
-        """Return the k-th joint that events add, added at q."""
+        """Return the k-th joint that events add, with the numbers that it takes from the state when it is added at q."""
         joint, frames = self.added[k], frames_of(self.mechanisms[SCENE].body_names, q)
         return jax.tree.map(number, joint.complete(*(frames[name] for name in joint.frame_names)))
 
 
 class _Switch(NamedTuple):
-    """A constraint that events switch on or off."""
+    """A constraint that is switched on or off during a run."""
 
     name: str  # in the mechanism with all switches
     public: str  # the name by which events release it; "" for contacts
@@ -130,7 +130,7 @@ class _Switch(NamedTuple):
 def phases_of(
     mechanism: Any, events: Sequence[Event], analysis: Analysis | None, sticking: tuple[StickingJoint, ...] = ()
 ) -> Phases:
-    """Return the phases of a mechanism, or of a system, with events. A system has one phase."""
+    """Return the phases of a mechanism or a system with these events; a system has one phase alone."""
     E = len(events)
     switches = _switches(mechanism, events, sticking) if mechanism.has_bodies else []
     if not switches:
@@ -166,12 +166,12 @@ def phases_of(
 def events_and_phases(
     mechanism: Any, events: Sequence[Event], analysis: Analysis | None
 ) -> tuple[Any, tuple[Event, ...], Phases]:
-    """Return a mechanism with directed frictions, all events, those of joints that may stick among them, and their phases.
+    """Return a mechanism with directed frictions, all events including those of joints that may stick, and the phases.
 
     Args:
         mechanism: The scene, or a system.
-        events: The events, expanded.
-        analysis: Its analysis; None for a system.
+        events: The events of the user, expanded.
+        analysis: The analysis of the scene; None for a system.
     """
     sticking = with_sticking_joints(mechanism, events)
     found = (*events, *sticking.events)
@@ -179,15 +179,15 @@ def events_and_phases(
 
 
 def _names_removed(mechanism: Mechanism, event: Event) -> frozenset[str]:
-    """Return the names of the constraints that an event removes; an added joint replaces another one of its name."""
+    """Return the names of the constraints that an event removes; a joint that it adds replaces another one of the same name."""
     addition = event.action.addition(mechanism, f"event {quote(event.name)}")
     return event.action.removed | ({addition[0]} if addition else frozenset())
 
 
 def _switches(mechanism: Mechanism, events: Sequence[Event], sticking: Sequence[StickingJoint]) -> list[_Switch]:
-    """Return the switches: constraints of the scene, joints that events add, contacts, joints that stick.
+    """Return the switches: of constraints of the scene, joints that events add, contacts, and locks of joints that stick.
 
-    Raises `ValueError` for unknown names.
+    Raise `ValueError` for unknown names.
     """
     additions = [(k, e.action.addition(mechanism, f"event {quote(e.name)}")) for k, e in enumerate(events)]
     added = [(k, *found) for k, found in additions if found is not None]
@@ -238,7 +238,7 @@ class HeldContact(Joint):
 
     @classmethod
     def of(cls, event: Event, mechanism: Mechanism) -> "HeldContact":
-        """Return the contact of an event; its bodies are all, or those in the attribute `bodies` of the condition."""
+        """Return the contact of an event; its bodies are those in the attribute `bodies` of the condition, else all."""
         condition, bodies = event.condition, getattr(event.condition, "bodies", mechanism.body_names)
         if not isinstance(condition, BodyCondition):
             return cls(bodies=bodies, labels=tuple(bodies), condition=condition)

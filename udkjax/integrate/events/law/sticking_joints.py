@@ -36,7 +36,7 @@ class ContactFriction(DirectedFriction):
 
 
 class SlidingSpeed(BodyCondition):
-    """Condition of sliding in the direction `sign`: the speed, or while the joint sticks, the limit minus its force."""
+    """The condition of sliding in the direction `sign`: the speed; while the joint sticks, `reserve` takes its place."""
 
     bodies: tuple[str, ...] = eqx.field(static=True)
     joint: Joint
@@ -56,23 +56,23 @@ class SlidingSpeed(BodyCondition):
 
         Args:
             multipliers: The multipliers of the joint.
-            lock: The multiplier of the constraint by which it sticks.
+            lock: The multiplier of the constraint by which the joint sticks.
         """
         return self.friction.largest_force(self.joint, multipliers) - self.sign * lock
 
 
 class StickOrSlip(Action):
-    """A joint with set-valued friction begins to slide, stops sliding or reverses; the run decides which."""
+    """The action by which a joint with set-valued friction begins to slide, stops or reverses; the run decides which of these."""
 
 
 class StickingJoint(NamedTuple):
-    """A joint with set-valued friction; hashable."""
+    """The static description of a joint with set-valued friction, or of a contact with friction; hashable."""
 
     name: str  # of the joint, or of the contact
     force: int  # index of the friction among the forces; those of contacts come last, beyond the forces of the scene
     event: int  # index of the event of sliding in the positive direction; that of the other direction follows
-    first: int  # index of its first side
-    contact: int = -1  # index of the event of the contact; -1: it is a joint
+    first: int  # index of its first side among all sides
+    contact: int = -1  # index of the event of the contact; -1: it is a joint of the scene
 
     @property
     def events(self) -> tuple[int, int]:
@@ -92,7 +92,7 @@ class Sticking(NamedTuple):
 
 
 def with_sticking_joints(mechanism: Any, others: Sequence[Event]) -> Sticking:
-    """Return a mechanism with directed frictions, and their events.
+    """Return a mechanism with directed frictions, its joints that may stick, and their events.
 
     Args:
         mechanism: The scene.
@@ -135,7 +135,7 @@ def friction_of(contact: Event, joint: str) -> ContactFriction:
 
 
 def lock_of(joint: Any) -> Joint:
-    """Return the constraint by which a joint sticks, without its position."""
+    """Return the constraint by which a joint sticks, without the position at which it does."""
     return Angle(joint.bodies) if isinstance(joint, Revolute) else Displacement(joint.bodies, joint.points, joint.axis)
 
 
@@ -147,8 +147,9 @@ def forces_of(
     Args:
         events: All events.
         rows: The row of Psi that holds the contact or the joint of an event; -1: none.
-        joint_rows: The rows of the joint that may stick.
-        multipliers: The multipliers of all rows; of a mechanism without the rows that hold, no contact rests and no joint sticks.
+        joint_rows: For each event of sliding, the rows of its joint; else empty.
+        multipliers: The multipliers of all rows of a mechanism. That of the scene lacks the rows by which contacts and joints are
+            held: the force of a contact is then 1, and a joint does not stick.
     """
     found: dict[int, Number] = {}
     for k, row in enumerate(rows):

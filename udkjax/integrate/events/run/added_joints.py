@@ -1,4 +1,4 @@
-"""Joints that events add, for machine code: programs that compute their numbers from the state at the event, and their places."""
+"""Joints that events add, for machine code: programs that compute their numbers from the state, and places of these numbers."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -16,14 +16,14 @@ from udkjax.scene.mechanism import Mechanism
 
 
 class AddedJoint(NamedTuple):
-    """A joint that an event adds, as a program that computes its numbers."""
+    """A program that computes the numbers of a joint that an event adds."""
 
-    program: ScalarProgram  # computes all numbers of the joint from q and its constant numbers
+    program: ScalarProgram  # all numbers of the joint, from q and the numbers that do not depend on q
     changing: tuple[int, ...]  # indices of the numbers that depend on q
 
 
 class NumberOf(NamedTuple):
-    """A placeholder for a leaf of a joint: its number of values."""
+    """A placeholder for an array of numbers of a joint, with its size."""
 
     size: int
 
@@ -34,7 +34,7 @@ def joint_numbers(phases: Phases) -> list[Array]:
 
 
 def added_joints(phases: Phases) -> tuple[AddedJoint, ...]:
-    """Return the joints that events add."""
+    """Return the programs of the joints that events add."""
     names, joints = phases.mechanisms[SCENE].body_names, []
     for joint in phases.added:
         arrays, rest = eqx.partition(joint, eqx.is_inexact_array)
@@ -54,7 +54,10 @@ def added_joints(phases: Phases) -> tuple[AddedJoint, ...]:
 
 
 def places_of_joints(mechanism: Mechanism, names: Sequence[str]) -> tuple[tuple[int, ...], ...]:
-    """Return the places of the numbers of switched joints among all numbers of a mechanism, without those that switch them."""
+    """Return the places of the numbers of each named joint among all numbers of a mechanism.
+
+    The last number of each joint, which switches it on and off, is left out.
+    """
     result = []
     for name in names:
         k = mechanism.joint_names.index(name)
@@ -69,7 +72,7 @@ def places_of_joints(mechanism: Mechanism, names: Sequence[str]) -> tuple[tuple[
 
 
 def evaluate_joint(joint: AddedJoint, q: Float[np.ndarray, "b n"], numbers: Float[np.ndarray, "b k"]) -> Float[np.ndarray, "b m"]:
-    """Return all numbers of a joint that is added in the given states."""
+    """Return all numbers (b, m) of a joint that is added at b positions q; `numbers` do not depend on q."""
     if len(q) == 1:  # Python floats take less time than arrays
         return np.array([joint.program([*q[0].tolist(), *numbers[0].tolist()])], float)
     return np.stack(joint.program.by_numpy([*q.T, *numbers.T]), axis=1)

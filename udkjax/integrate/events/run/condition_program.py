@@ -29,7 +29,7 @@ def condition_numbers(events: Sequence[Event]) -> list[Array]:
 
 
 def watched_conditions(events: Sequence[Event], mechanism: Any) -> Conditions | None:
-    """Return the conditions of the events of a mechanism as programs; None if machine code lacks an instruction for one."""
+    """Return the conditions of the events of a mechanism as programs; None if machine code lacks one of their operations."""
     return (_concrete_conditions if is_concrete(mechanism, *events) else _conditions)(mechanism, *events)
 
 
@@ -66,7 +66,7 @@ def _conditions(mechanism: Any, *events: Event) -> Conditions | None:
 
 
 def _bytes_of(conditions: Conditions | None) -> int:
-    """Estimate the memory of conditions: of an operation in the programs and in their text."""
+    """Return an estimate of the memory (bytes) of conditions, from the number of operations of their programs."""
     return 0 if conditions is None else 500 * (len(conditions.program.order) + len(conditions.at_state.order))
 
 
@@ -82,13 +82,15 @@ def _concrete_conditions(mechanism: Any, *events: Event) -> Conditions | None:
 
 
 def with_forces(conditions: Conditions, events: Sequence[Event], switches: Switches, m: int) -> Conditions:
-    """Return the conditions with the forces of all contacts and joints that the switches hold; as they are if there are none.
+    """Return the conditions with a program for the forces of all contacts and joints that switches hold.
+
+    The conditions are returned unchanged if there are none.
 
     Args:
         conditions: The conditions.
         events: All events.
         switches: The switches.
-        m: The number of rows of the mechanism.
+        m: The number of rows of Psi of the mechanism.
     """
     if max(switches.rows, default=-1) < 0:
         return conditions
@@ -109,9 +111,10 @@ def with_forces(conditions: Conditions, events: Sequence[Event], switches: Switc
 
 
 class _Functions:
-    """The conditions of events that are plain functions, None for others; equal if they compute the same, now and later.
+    """The conditions of events that are plain functions, None for other conditions; a key of a cache.
 
-    Equal conditions have equal programs and code, and refer to equal numbers and strings, or to identical objects.
+    Two lists are equal if their functions compute the same, also in future: they have equal programs and code, and refer to equal
+    numbers and strings, or to identical objects.
     """
 
     def __init__(self, events: Sequence[Event], programs: Conditions):
@@ -142,7 +145,7 @@ def _first_of_equals(functions: _Functions) -> _Functions:
 
 
 def with_cached_functions(events: Sequence[Event], programs: Conditions) -> tuple[Event, ...]:
-    """Return events with equal functions of earlier events instead of their own, so that code compiled for these is reused.
+    """Return the events with condition functions replaced by equal ones of earlier calls, whose compiled code is then reused.
 
     A function defined within another is a new object in each call.
     """
@@ -161,7 +164,7 @@ _share_concrete_functions = cached_by_identity(_share_functions)
 
 
 def input_array(graph: Graph, k: int, shape: tuple[int, ...]) -> np.ndarray:
-    """Return the k-th array of inputs of a graph."""
+    """Return the k-th input of a graph, an array of scalars of this shape."""
     array = np.empty(shape, object)
     for index in np.ndindex(*shape):
         array[index] = graph.input((k, index), "condition")
@@ -171,12 +174,12 @@ def input_array(graph: Graph, k: int, shape: tuple[int, ...]) -> np.ndarray:
 def trace_scalars(
     graph: Graph, function: Callable[..., Any], arguments: Sequence[np.ndarray], listed: Sequence[int]
 ) -> list[np.ndarray]:
-    """Return the outputs of a function as arrays of scalars of a graph.
+    """Return the outputs of a function of arrays, traced into a graph, as arrays of its scalars.
 
     Args:
         graph: The graph.
-        function: The function of arrays.
-        arguments: Its arguments as arrays of scalars.
+        function: The function.
+        arguments: Its arguments, arrays of scalars of the graph.
         listed: The positions of arguments that the function receives as lists of numbers, whose entries take no operations.
     """
     given = [[np.asarray(x, object) for x in array] if k in listed else array for k, array in enumerate(arguments)]
@@ -189,6 +192,6 @@ def _text(program: ScalarProgram) -> str:
 
 
 def conditions_of(events: Sequence[Event], names: tuple[str, ...], t: Array, q: Any, v: Any) -> Float[Array, "E"]:
-    """Return the conditions of all events at a state, with the names of the bodies; a system has none."""
+    """Return the values of the conditions of all events at a state; `names` are those of the bodies, () for a system."""
     arguments = (frames_of(names, q, v),) if names else (q, v)
     return jnp.stack([jnp.asarray(e.condition(t, *arguments), float) for e in events])

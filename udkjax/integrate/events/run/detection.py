@@ -29,7 +29,7 @@ REDONE = 4  # intervals before a coarse one that are repeated
 
 
 class _Arithmetic(NamedTuple):
-    """The arithmetic of arrays for `classify_interval`."""
+    """The functions `min` and `max` of arrays, for `Resolution.classify_interval`."""
 
     min: Callable[..., Any]
     max: Callable[..., Any]
@@ -78,11 +78,11 @@ def detect(
 
     Args:
         nodes: the conditions at the nodes of the window.
-        has_rates: conditions with given rates; the rates of others are estimated by differences.
+        has_rates: mask of the conditions with given rates; the rates of others are estimated by differences.
         direction: direction of the crossings of each condition, 0 for either.
         sides: the sides of zero at the first node.
         scale: scale of each condition.
-        zero: bound below which it is zero, relative to its scale.
+        zero: bound below which each condition is zero, relative to its scale.
         located: the condition that certainly crosses zero in this window; -1: none.
         watched: mask of the watched conditions.
         late: time (s) by which an event may be early: at the first node, its condition may still be on the other side.
@@ -141,7 +141,7 @@ def detect(
 def _slopes(
     t: Float[Any, "G"], g: Float[Any, "G C"], g_dot: Float[Any, "G C"], has_rates: Bool[np.ndarray, "C"], xp: ModuleType
 ) -> Float[Any, "G C"]:
-    """Return the rates at the nodes, from differences of second order if they are not given or not finite."""
+    """Return the rates of conditions at the nodes: those given, or differences of second order if none are given or finite."""
     step = xp.diff(t)[:, None]
     secant = xp.diff(g, axis=0) / xp.where(step > 0, step, 1.0)
     total = step[1:] + step[:-1]

@@ -1,4 +1,4 @@
-"""Runs with events by machine code, as functions of arrays: called at once, or from compiled programs of JAX."""
+"""Runs with events by machine code as functions of arrays, called directly or from compiled programs of JAX."""
 
 import math
 from collections.abc import Sequence
@@ -41,7 +41,7 @@ SHARED, NUMBERS = 9, 5  # number of arrays before those of the phases, and index
 
 @dataclass(frozen=True)
 class PlainForm:
-    """A run in its plain form as a function of arrays: the fallback for members that machine code cannot resolve."""
+    """A run in its plain form, by JAX, as a function of arrays: the fallback for members that machine code cannot resolve."""
 
     tree: TreeDef  # structure of the system
     others: tuple[Any, ...]  # leaves of the system that are not arrays, None in place of arrays
@@ -87,13 +87,13 @@ def run_by_machine_code(hybrid: Hybrid, conditions: Conditions) -> EventRun:
 
 @dataclass(frozen=True)
 class HostRun:
-    """Runs of the members of a batch, as a function of arrays of NumPy (native/host/host_function.py).
+    """Runs with events of the members of a batch, a `HostFunction` of NumPy arrays (native/host/host_function.py).
 
     Attributes:
-        plan: common part of all runs.
+        plan: static part of all runs.
         times: number of output times.
-        coordinates: n.
-        plain: the plain form of a run of one member. If it is None, unresolved members get the code -1.
+        coordinates: number n of coordinates.
+        plain: the plain form of a run of one member. If it is None, members that machine code cannot resolve get the code -1.
     """
 
     plan: MachinePlan
@@ -103,7 +103,7 @@ class HostRun:
 
     @property
     def needed_by(self) -> str:
-        """The reason why the run calls Python, with the cure."""
+        """The reason why a run calls Python, with the cure, for messages."""
         joints = [quote(joint.name) for joint in self.plan.events.sticking if joint.contact < 0]
         if joints:
             return f'joints stick ({", ".join(joints)}): give their friction law="smooth"'
@@ -111,7 +111,7 @@ class HostRun:
 
     @property
     def description(self) -> str:
-        """The events and the structure of the system."""
+        """A text that tells this function from others in all processes: the events, and the structure of the system."""
         return f"{self.plan.events} {self.times} {self.plain and (self.plain.tree, self.plain.others, self.plain.shapes)}"
 
     def shapes(self, members: int) -> list[tuple[int, ...]]:
@@ -150,13 +150,13 @@ class HostRun:
 def machine_plan(
     plan: EventPlan, phases: Phases, events: Sequence[Event], compiled: Sequence[CompiledMechanism], conditions: Conditions
 ) -> MachinePlan:
-    """Return the common part of runs.
+    """Return the static part of runs by machine code.
 
     Args:
-        plan: the events and phases.
+        plan: the plan of the events.
         phases: the phases.
         events: all events.
-        compiled: the mechanisms of the phases.
+        compiled: the mechanisms of the phases, compiled.
         conditions: conditions of all events.
     """
     added, of_kinks = added_joints(phases), places_of_kinks(events, phases.held)
@@ -172,7 +172,7 @@ _plan_for_structure = cached_by_size(lambda plan: PLAN_BYTES * len(plan.phases),
 
 @cached_by_identity
 def concrete_plan(phases: Phases, conditions: Conditions, max_steps: int, max_events: int, *others: Any) -> MachinePlan:
-    """Return the plan from all events, then the compiled mechanisms; their numbers are concrete."""
+    """Return the static part of runs with concrete numbers; `others` are all events, then the compiled mechanisms."""
     count = len(others) - len(phases.mechanisms)
     events, compiled = others[:count], others[count:]
     plan = event_plan(phases, events, max_steps, max_events, conditions.by_velocity)
@@ -188,14 +188,14 @@ def event_arrays(
     drift_tol: Float[Any, ""],
     xp: ModuleType = jnp,
 ) -> list[Any]:
-    """Return the arrays of one run, with a leading axis of members.
+    """Return the inputs of `HostRun` for one run, each with a leading axis for its one member.
 
     Args:
-        plan: common part of all runs.
+        plan: static part of all runs.
         events: all events.
         phases: the phases.
-        problems: the run of each mechanism.
-        code: the `Result` before the run.
+        problems: the problem of each mechanism of the phases.
+        code: the `Result` as far as it is known before the run.
         drift_tol: the violation of the constraints that ends the run.
         xp: jax.numpy, or NumPy.
     """

@@ -95,7 +95,7 @@ class Hybrid(eqx.Module):
         return RunState(self.ts[0], self.q, self.v, jnp.array(self.plan.first), (*self.phases.first_added(), self.sides))
 
     def problem(self, which: int, ts: Float[Array, "T"], start: RunState) -> Problem:
-        """Return the problem to integrate from a state, of the mechanism `which`."""
+        """Return the problem to integrate the mechanism `which`, SCENE or SWITCHED, over the times `ts` from a state."""
         _, q, v, phase, added = start
         mechanism, analysis = self.phases.mechanism(which, phase, added), self.phases.analyses[which]
         equations = equations_of(mechanism, self.method, self.baumgarte, self.formulation, analysis)
@@ -119,7 +119,7 @@ class Hybrid(eqx.Module):
         )
 
     def flow(self, ts: Float[Array, "T"], state: RunState, derivatives: bool) -> IntegratorOutput:
-        """Integrate from a state over the times `ts`, which begin with the time of the state."""
+        """Integrate from a state over the times `ts`, the first of which is that of the state; with `derivatives` or without."""
 
         def of_mechanism(which: int, ts: Array, state: RunState) -> IntegratorOutput:
             problem = self.problem(which, ts, state)
@@ -143,11 +143,12 @@ class Hybrid(eqx.Module):
 
         Args:
             phase: the phase.
-            function: function to compute.
-            *arguments: its arrays.
+            function: the function to call.
+            *arguments: its other arguments, which have arrays.
             is_free: whether the phase is known to have no contact at rest.
-            integrates: whether the function integrates, which takes less time with the mechanism of the scene. All else is traced
-                once for a replay, with the mechanism whose contacts and locks are all off in the phase of the scene.
+            integrates: whether the function integrates, which takes less time with the mechanism of the scene. In a replay where
+                all switches are contacts and locks, other functions are traced once only: all switches are off in the first
+                phase, so that the mechanism SWITCHED serves all phases.
         """
         if len(self.phases.mechanisms) == 1 or (is_free and self.plan.has_only_contacts):
             return function(SCENE, *arguments)
@@ -157,30 +158,30 @@ class Hybrid(eqx.Module):
         return jax.lax.switch(self.plan.is_first(phase).astype(int), branches, *arguments)
 
     def textbook(self, which: int, at: RunState) -> Any:
-        """Return the equations, solved by SVD, of the mechanism `which` (SCENE or SWITCHED) in the phase of a state."""
+        """Return the equations of the mechanism `which`, SCENE or SWITCHED, in the phase of a state; SVD solves them."""
         mechanism = self.phases.mechanism(which, at.phase, at.joints)
         return equations_of(mechanism, SVD(), self.baumgarte, analysis=self.phases.analyses[which])
 
     # --- conditions
 
     def conditions(self, added: Added) -> Condition:
-        """Return the conditions of all events as a function of t, q and v; comparisons in forces have the sides in `added`."""
+        """Return the conditions of all events as a function of t, q and v; the last entry of `added` has all sides."""
         events = with_sides(self.events, added[-1], self.phases.held)
         return lambda t, q, v: conditions_of(events, self.names, t, q, v)
 
     def conditions_and_rates(self, added: Added) -> Callable[..., tuple[Float[Array, "E"], Float[Array, "E"]]]:
-        """Return a function for the conditions and their rates, right only for conditions of positions alone."""
+        """Return a function of t, q and v for the conditions and their rates, right for conditions of positions alone."""
         conditions = self.conditions(added)
         return lambda t, q, v: rate_along(conditions, t, q, v, jnp.zeros_like(v))
 
     def turned(self, at: RunState, k: Int[Array, ""]) -> Float[Array, "S"]:
-        """Return the sides of the comparisons in forces (S,) after event k at a state."""
+        """Return all sides (S,) after event k at a state."""
         factor, shift = (jnp.asarray(x)[k] for x in self.plan.side_changes)
         sides = at.joints[-1] * factor + shift
         return stop_gradients(renewed_sides(self.phases.held, self.phases.mechanisms[SCENE], at.t, at.q, at.v, sides))
 
     def values(self, at: RunState, is_free: bool = False, is_directed: bool = False, has_forces: bool = False) -> StateValues:
-        """Return conditions and their derivatives in a state; see `System.look`."""
+        """Return the conditions and their derivatives at a state; for the arguments see `System.look`."""
         t, q, v, _, added = at
         conditions = self.conditions(added)
         by_t, by_q, by_v = jax.jacfwd(conditions, (0, 1, 2))(t, q, v)

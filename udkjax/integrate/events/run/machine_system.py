@@ -1,7 +1,9 @@
 """Runs with events by machine code: all members of a batch together, from one crossing to the next.
 
-Members whose conditions vary too quickly for machine code, or are NaN, go on window by window (`machine_windows`). Those whose
-forces machine code cannot compute there are `unresolved` and stop: the plain form (`plain_system`) runs them.
+Members whose conditions vary too quickly for machine code, or are NaN, go on window by window (`machine_windows`). A member whose
+forces machine code cannot compute in a window stops as `unresolved`: its run is repeated in the plain form (`plain_system`).
+
+A stretch is the motion of a member from one event to the next crossing, or to the end of its run.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -44,25 +46,25 @@ class MachinePlan(NamedTuple):
 
 
 class MemberUnits(NamedTuple):
-    """Characteristic units of each of B members, and its tolerance of drift."""
+    """The characteristic units of each of B members, and the tolerance of drift."""
 
     rate: Any  # characteristic rate of the system and the run (1/s)
     length: Any  # (m)
     scene_rate: Any  # (1/s)
     mass: Any  # (kg)
-    drift_tol: Any
+    drift_tol: Any  # violation of Psi, relative to the scales of the rows, that ends a run
 
 
 class MachineSystem:
     """The motion of the members of a batch (`system.System`) by machine code.
 
     Args:
-        plan: common part of all runs.
+        plan: static part of all runs.
         phases: the machine code of the phases of each mechanism.
         ts: output times (B, T).
-        units: numbers of each member.
+        units: characteristic units of each member.
         of_actions: the numbers of all actions (B, N, E), as `actions.numbers_of_actions`.
-        inverse_mass: of all coordinates (B, n).
+        inverse_mass: one over the mass of each coordinate (B, n).
         joint_numbers: the numbers of joints that events add, except those that depend on the state (B, k).
         event_numbers: the numbers of all events (1 or B, K).
     """
@@ -81,7 +83,7 @@ class MachineSystem:
         event_numbers: np.ndarray,
     ):
         self._event_numbers, self._held = event_numbers, plan.held
-        self.lost_kinks = np.full(len(ts), np.inf)  # times (s) from which sides are no longer held
+        self.lost_kinks = np.full(len(ts), np.inf)  # times (s) from which the sides of kinks are free
         self.plan, self._added, self._is_projected = plan.events, plan.added, [x.projected for x in plan.phases]
         self._phases, self.ts, self._units, self._of_actions = phases, ts, units, of_actions
         self.inverse_mass, self._joint_numbers = inverse_mass, joint_numbers
@@ -105,11 +107,11 @@ class MachineSystem:
     def look(
         self, members: MemberIndices, at: RunState, is_free: bool = False, is_directed: bool = False, has_forces: bool = False
     ) -> StateValues:
-        """Evaluate the conditions of members at states."""
+        """Return the values of the conditions of members at states; see `System.look`."""
         return StateValues(*self._by_phase(members, at, PhaseCode.at))
 
     def project(self, members: MemberIndices, at: RunState, is_free: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return q and v projected to the constraints of their phases, and the largest remaining row of Psi_dot per scale."""
+        """Return q and v projected to the constraints of their phases, and the largest remaining |Psi_dot_i| over its scale."""
         q, v, left = self._by_phase(members, at, PhaseCode.project)
         return q, v, left
 
@@ -127,12 +129,12 @@ class MachineSystem:
         return results
 
     def _mechanisms(self, phase: Bool[np.ndarray, "b C"]) -> Iterator[tuple[int, Bool[np.ndarray, "b"]]]:
-        """Iterate over the mechanisms of phases, each with a mask of its phases."""
+        """Yield the mechanisms of phases, SCENE, SWITCHED or both, each with a mask of the phases that belong to it."""
         is_first = self.plan.is_first(phase)
         yield from ((which, here) for which, here in ((SCENE, is_first), (SWITCHED, ~is_first)) if here.any())
 
     def add_joints(self, members: MemberIndices, new: Bool[np.ndarray, "b A"], q: np.ndarray, joints: Any) -> Any:
-        """Return the numbers of the joints that events have added; masked `new` ones are added at positions q."""
+        """Return `joints` after adding the joints that are masked in `new` at positions q; their numbers change in place."""
         indices, start = self._all if members is None else members, 0
         for joint, numbers, here in zip(self._added, joints[:-1], new.T, strict=True):
             count = len(joint.program.inputs) - q.shape[1]
@@ -143,21 +145,21 @@ class MachineSystem:
         return joints
 
     def sides(self, members: MemberIndices, joints: Any) -> Float[np.ndarray, "b S"]:
-        """Return the sides of the comparisons in forces of members (b, S): the last numbers of `joints`."""
+        """Return all sides of members (b, S): the last entry of `joints`."""
         return take(joints[-1], members)
 
     def with_sides(self, members: MemberIndices, joints: Any, sides: Float[np.ndarray, "b S"]) -> Any:
-        """Return `joints` with other sides of the comparisons in forces of members; changed in place."""
+        """Return `joints` after replacing all sides of members, in place."""
         joints[-1][self._all if members is None else members] = sides
         return joints
 
     def turned(self, members: MemberIndices, k: Int[np.ndarray, "b"], at: RunState) -> Float[np.ndarray, "b S"]:
-        """Return the sides of the comparisons in forces of members after event k at their states."""
+        """Return all sides of members (b, S) after event k at their states."""
         factor, shift = self.plan.side_changes
         return self._renew(members, at, self.sides(members, at.joints) * factor[k] + shift[k])
 
     def first_sides(self, at: RunState) -> Float[np.ndarray, "B S"]:
-        """Return the sides of the comparisons in forces of all members at the start (B, S)."""
+        """Return all sides of all members at the start (B, S)."""
         unknown = np.full_like(at.joints[-1], FREE)
         unknown[:, : self.plan.first_kink_side] = 0.0
         return self._renew(None, at, unknown)
@@ -172,19 +174,22 @@ class MachineSystem:
         return result
 
     def when(self, mask: Bool[np.ndarray, "B"], change: Change, runs: MemberRuns) -> MemberRuns:
-        """Return the runs with a change of the masked members."""
+        """Return the runs after `change(runs, members)` of the masked members."""
         members = np.flatnonzero(mask)
         return runs if not members.size else change(runs, None if members.size == mask.size else members)
 
     def repeat(self, change: Callable[[MemberRuns], MemberRuns], runs: MemberRuns) -> MemberRuns:
-        """Return the runs after changing them until none is running."""
+        """Return the runs after repeating a change until none of them is running."""
         with np.errstate(all="ignore"):
             while runs.running.any():
                 runs = change(runs)
         return runs
 
     def advance(self, runs: MemberRuns, members: MemberIndices) -> MemberRuns:
-        """Take members to their next crossings, or to their ends, by one call of machine code for each mechanism."""
+        """Return the runs with members at their next crossings, or at their ends, by one call of machine code for each mechanism.
+
+        Members that go on window by window advance by one window.
+        """
         indices = self._all if members is None else members
         if self._windows:
             by_windows = np.isin(indices, list(self._windows))
@@ -196,12 +201,12 @@ class MachineSystem:
         return runs
 
     def go_on_by_windows(self, members: Int[np.ndarray, "b"], t: Float[np.ndarray, "b"]):
-        """Let members go on window by window, from their times."""
+        """Let members go on window by window, from the times t (s)."""
         for member, start in zip(members, t, strict=True):
             self._windows[int(member)] = first_window(self.ts[member], start, self.plan.count, np)
 
     def unresolved_from(self, runs: MemberRuns) -> Float[np.ndarray, "B E"]:
-        """Return the times (s) from which conditions vary too quickly to be resolved, or sides are no longer held."""
+        """Return the times (s) from which conditions vary too quickly to be resolved, or sides of kinks are free; else inf."""
         found = np.where(self.plan.kinks, self.lost_kinks[:, None], np.inf)
         for member, window in self._windows.items():
             # A condition may vary quickly before it becomes NaN, but the result of the run already reports the NaN.
@@ -289,7 +294,7 @@ class MachineSystem:
             self._note_passed(runs, which, members, stretch.passed)
 
     def _note_passed(self, runs: MemberRuns, which: int, members: Int[np.ndarray, "b"], passed: PassedEvents):
-        """Record the events that machine code has passed, and what they have changed."""
+        """Record the events that machine code has passed (passed_events.py), and update sides, phases and locks accordingly."""
         noted = (np.arange(passed.t.shape[1]) < passed.count[:, None]) & (passed.t <= runs.t[members, None])
         b, k = np.nonzero(noted)
         if not b.size:
@@ -332,7 +337,10 @@ class MachineSystem:
         known: Bool[np.ndarray, "b"],
         drifts: Bool[np.ndarray, "b"],
     ):
-        """Store the results and ends of the runs that stop."""
+        """Handle members whose stretch ended neither at a crossing nor at the end of the run.
+
+        They repeat it with tighter tolerances, go on with free sides or window by window, or end with a `Result`.
+        """
         status, (n, fails) = stretch.info[:, STATUS], (runs.q.shape[1], ~known)
         unresolved = (status == Status.UNRESOLVED) & ~drifts
         repeated = unresolved & self._tighten(runs, which, members)
@@ -353,7 +361,7 @@ class MachineSystem:
         runs.t[members[fails]], runs.q[members[fails]], runs.v[members[fails]] = last
 
     def _watch(self, runs: MemberRuns, which: int, members: Int[np.ndarray, "b"]) -> Float[np.ndarray, "b K"]:
-        """Return the input that describes watched conditions: room for numbers, sides, masks, tolerances, directions."""
+        """Return the input of machine code that describes watched conditions: room for numbers, sides, masks, tolerances, ..."""
         where, E, watch = self._watched[which], self.plan.count, self._watches[which][members]
         room, C = self._rooms[which], len(where)
         watch[:, room : room + C] = runs.sides[members[:, None], where]
@@ -365,7 +373,7 @@ class MachineSystem:
         return watch
 
     def _events_to_pass(self, runs: MemberRuns, members: Int[np.ndarray, "b"], most: int) -> Int[np.ndarray, "b"]:
-        """Return the number of events that the next call may pass: `most`, or those left of the limits of events and kinks."""
+        """Return the number of events that the next call may pass: `most`, or fewer if a limit of events or kinks is near."""
         kinks = runs.kink_count(self.plan, members)
         return np.minimum(np.minimum(MOST_KINKS - 1 - kinks, self.plan.max_events - (runs.count[members] - kinks)), most)
 

@@ -20,11 +20,11 @@ class MachineMotion:
     Args:
         plan: the phases and events.
         code: the machine code of the mechanism of the phase.
-        member: the member.
-        ts: its output times.
-        units: its numbers.
-        coordinates: its units of coordinates.
-        watched: mask of the conditions, and of the forces, that are watched.
+        member: the index of the member.
+        ts: output times of the member (s).
+        units: units and tolerances of the member.
+        coordinates: the units of its coordinates.
+        watched: mask of the conditions, then of the forces, that are watched.
 
     Attributes:
         lacks_forces: whether a watched force could not be computed, as a pivot was too small.
@@ -57,7 +57,7 @@ class MachineMotion:
     def watch(
         self, state: RunState, t: Float[np.ndarray, "G"], q: Float[np.ndarray, "G n"], v: Float[np.ndarray, "G n"]
     ) -> tuple[Float[np.ndarray, "G E"], ...]:
-        """Return conditions, their rates, and forces at times in the phase of a state; 1 for forces that nothing holds."""
+        """Return conditions, their rates, and forces at times in the phase of a state; forces that are not watched are 1."""
         values = self._code.at(np.full(len(t), self._member), _repeated(state, t, q, v))
         is_known = np.isfinite(q).all(1) & np.isfinite(v).all(1)
         self.lacks_forces = bool(self._holds.any() and (is_known & ~values.has_safe_forces).any())
@@ -65,5 +65,5 @@ class MachineMotion:
 
 
 def _repeated(state: RunState, t: np.ndarray, q: np.ndarray, v: np.ndarray) -> RunState:
-    """Return states in the phase of one state."""
+    """Return states at several times, in the phase and with the joints of one state."""
     return RunState(t, q, v, np.broadcast_to(state.phase, (len(t), *state.phase.shape)), state.joints)

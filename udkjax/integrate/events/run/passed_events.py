@@ -29,10 +29,10 @@ class NumberPlaces(NamedTuple):
 def passed_events(
     plan: EventPlan, phases: Phases, conditions: Conditions, of_kinks: KinkPlaces, added: Sequence[AddedJoint], at: NumberPlaces
 ) -> dict[str, Any]:
-    """Return the events that runs of a mechanism pass, as arguments of `RunStates.watching`; empty if there are none.
+    """Return the arguments of `RunStates.watching` for the events that runs of a mechanism pass; empty if there are none.
 
     Args:
-        plan: the events.
+        plan: the plan of the events.
         phases: the phases.
         conditions: the conditions that runs of this mechanism watch.
         of_kinks: places of kinks among the numbers of events.
@@ -95,7 +95,7 @@ def _slides(plan: EventPlan, conditions: Conditions, added: Sequence[AddedJoint]
 def _numbers_of_locks(
     plan: EventPlan, locks: Sequence[dict[str, Any]], added: Sequence[AddedJoint], at: NumberPlaces
 ) -> list[tuple[int, str, int]]:
-    """Return which numbers of the mechanism are numbers of locks: triples (index, "locks", index as in `Sliding.lock_count`)."""
+    """Return the numbers of the mechanism that are numbers of locks: triples (index, "locks", index among the latter)."""
     lock_count, found = len(locks), []
     first_lock = len(added) - lock_count  # locks are the last joints that events add
     start = 2 * lock_count  # numbers of locks: first all switches, then all marks of rows, then numbers that depend on q
@@ -133,7 +133,7 @@ class PassedEvents(NamedTuple):
 
     @classmethod
     def of(cls, record: Float[np.ndarray, "b R"], passing: Any, n: int) -> "PassedEvents":
-        """Return the events in the records of runs that pass events."""
+        """Return the events in the records of b runs; `passing` is the `Passing` of their machine code."""
         count, first = record[:, 0].astype(int), 1 + passing.locks
         rows = record[:, first:].reshape(len(record), passing.most, -1)[:, : count.max(initial=0)]
         event, t, q, v, v_after, sides, locked = np.split(rows, np.cumsum([1, 1, n, n, n, passing.sides]), axis=2)

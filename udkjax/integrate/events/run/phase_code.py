@@ -33,7 +33,7 @@ ALL = np.ones(1, bool)  # of one member
 
 
 class ValuesLayout:
-    """The values of conditions at states in the results of `EvaluateEvents`, one after another.
+    """The layout of `StateValues` in the flat results of the operation `EvaluateEvents`.
 
     Args:
         operation: the operation.
@@ -53,7 +53,7 @@ class ValuesLayout:
             start += math.prod(shape)
 
     def values(self, results: Float[Any, "b K"], xp: ModuleType) -> StateValues:
-        """Return the values of b states."""
+        """Return the values of b states from the results (b, K) of the operation."""
         b, conditions, E = len(results), self._conditions, self._count
         values = [xp.reshape(results[:, place], (b, *shape)) for place, shape in self._places]
         n = self._places[0][1][0]
@@ -70,7 +70,7 @@ class ValuesLayout:
 
 
 def _put(x: Any, columns: Any, new: Any, xp: ModuleType) -> Any:
-    """Return an array with other columns; one of NumPy changes in place."""
+    """Return an array with `new` values in some columns; a NumPy array changes in place."""
     if xp is not np:
         return x.at[:, columns].set(new)
     x[:, columns] = new
@@ -82,16 +82,16 @@ class PhasePlan(NamedTuple):
 
     run: RunWatched
     states: EvaluateEvents
-    marking: MarkRows | None  # marks independent rows; None if this is not needed
-    projected: bool
+    marking: MarkRows | None  # marks independent rows; None if no marks are needed
+    projected: bool  # whether each step is projected onto the constraints
     project: StateOperation  # of states whose velocities an event has changed; compiled by its first call
-    joints: tuple[tuple[int, ...], ...]  # places of the numbers of each such joint, then of the sides of comparisons
+    joints: tuple[tuple[int, ...], ...]  # places of the numbers of each joint that events add, then of all sides
     active: tuple[tuple[int, int], ...]  # places of the numbers that switch constraints on, each with the index of the switch
     sides_of_events: tuple[tuple[int, int], ...]  # places of sides among the numbers of events, with the index of the side
 
     @property
     def number_count(self) -> int:
-        """The number of numbers of the conditions."""
+        """The number of the numbers that conditions depend on."""
         return 0 if self.run.conditions is None else self.run.conditions.number_count
 
     @property
@@ -101,7 +101,7 @@ class PhasePlan(NamedTuple):
 
     @property
     def count(self) -> int:
-        """The number of arrays of the phases."""
+        """The number of arrays of `phase_arrays`."""
         return len(PARTS) + bool(self.run.sampled)
 
 
@@ -117,8 +117,8 @@ def phase_plan(
     """Return the operations of the phases of the mechanism `which`, SCENE or SWITCHED.
 
     Args:
-        which: the mechanism.
-        plan: the events.
+        which: SCENE or SWITCHED.
+        plan: the plan of the events.
         phases: all phases.
         compiled: the mechanism, compiled.
         conditions: conditions of all events, with forces.
@@ -150,12 +150,12 @@ def phase_plan(
 
 
 def _marking(textbook: Any) -> MarkRows:
-    """Return the operation that marks independent rows among those that numbers mark as possible."""
+    """Return the operation that marks independent rows among those that its inputs mark as candidates."""
     return MarkRows(textbook.programs_of_marked_rows)
 
 
 def phase_arrays(problem: Problem, plan: PhasePlan, xp: ModuleType = jnp) -> list[Any]:
-    """Return the arrays of a phase, with a leading axis for members."""
+    """Return the arrays of the phases of one mechanism, each with a leading axis for its one member: `PARTS`, then samples."""
     if plan.marking is not None:
         problem = replace(problem, marks=np.ones(plan.run.code.row_count))
     inputs = run_inputs(problem, plan.run, xp)
@@ -169,19 +169,22 @@ def phase_arrays(problem: Problem, plan: PhasePlan, xp: ModuleType = jnp) -> lis
 
 
 class StretchEnd(NamedTuple):
-    """The ends of runs, at a crossing or elsewhere, and their outputs; integers are stored as floats."""
+    """The results of stretches of b members, which end at a crossing, at the end of the run or with a failure.
+
+    Integers are stored as floats.
+    """
 
     q: Float[np.ndarray, "b T n"]  # at the requested times
     v: Float[np.ndarray, "b T n"]
-    violation: Float[np.ndarray, "b T"]
+    violation: Float[np.ndarray, "b T"]  # of Psi, over the scales of the rows
     info: Float[np.ndarray, "b K"]  # `RunStates.info_names`, and the last state of the integrator
     event: Float[np.ndarray, "b"]  # index of the watched quantity that crosses; -1: none
     t: Float[np.ndarray, "b"]  # the end (s); no event happens before
     worst: Float[np.ndarray, "b"]  # largest violation at a node
-    sides: Float[np.ndarray, "b C"]
+    sides: Float[np.ndarray, "b C"]  # of zero, of the watched conditions and forces at t
     q_end: Float[np.ndarray, "b n"]  # at t
     v_end: Float[np.ndarray, "b n"]
-    passed: PassedEvents | None  # None if runs pass no events
+    passed: PassedEvents | None  # None if this machine code passes no events
 
 
 class PhaseCode:
@@ -194,7 +197,7 @@ class PhaseCode:
         event_numbers: the numbers of all events.
         inverse_mass: one over the mass of each coordinate.
         joints: the numbers of the joints that events have added, then all sides, for all members; changed in place.
-        widths: the number of those of each joint, then of sides.
+        widths: the number of numbers of each joint, then of sides.
     """
 
     def __init__(
@@ -229,25 +232,26 @@ class PhaseCode:
         self._no_marks = np.full((len(joints), plan.run.code.row_count), np.nan)
 
     def atol(self, members: Int[np.ndarray, "b"]) -> Float[np.ndarray, "#b 1"]:
-        """Return the absolute tolerance of members, in units of the scene."""
+        """Return the absolute tolerance of members, in units of the scene, as a column."""
         return _of(self._settings, members)[:, [self.plan.run.all_settings.index("atol")]]
 
     def tolerances(self, members: Int[np.ndarray, "b"]) -> Float[np.ndarray, "b"]:
-        """Return the smaller one of the relative tolerance and the absolute one, in units of the scene, that are not zero."""
+        """Return the smaller nonzero tolerance of members: the relative one, or the absolute one in units of the scene."""
         both = _of(self._settings, members)[:, self._tolerances]
         return np.broadcast_to(np.where(both > 0, both, np.inf).min(axis=1), len(members))
 
     def run(
         self, members: Int[np.ndarray, "b"], ts: np.ndarray, state: RunState, watch: np.ndarray, tightened: Float[np.ndarray, "b"]
     ) -> StretchEnd:
-        """Run members over times (b, T) to the first crossing.
+        """Integrate members over times (b, T), up to their first crossing.
 
         Args:
-            members: the members.
-            ts: the times.
-            state: their states.
-            watch: describes the conditions, with room for their numbers.
-            tightened: factors of their tolerances.
+            members: the indices of the members.
+            ts: the times (s).
+            state: the states of the members.
+            watch: the input that describes the watched conditions (`MachineSystem._watch`); this function puts their numbers
+                and the sides of comparisons in it.
+            tightened: factors of the tolerances of members.
         """
         _, q, v, *_ = state
         conditions = self.plan.run.conditions
@@ -269,7 +273,7 @@ class PhaseCode:
         return StretchEnd(qs, vs, violation, info, event, t, worst, sides, q_end, v_end, passed)
 
     def flow(self, member: int, ts: Float[np.ndarray, "T"], state: RunState) -> IntegratorOutput:
-        """Integrate a member over times, whatever its conditions; its state has a leading axis of length one."""
+        """Integrate a member over times without watching conditions; its state has a leading axis of length one."""
         members, run = np.array([member]), MemberCalls(self.plan.run.unwatched)
         further = [_of(x, members) for x in (self._settings, self._rows, self._breaks, *self._samples)]
         return integrator_output(run(self._with_marks(members, state), ts[None], state.q, state.v, *further, times=len(ts)))
@@ -279,11 +283,11 @@ class PhaseCode:
         return self._breaks[member if len(self._breaks) > 1 else 0]
 
     def setting(self, name: str, member: int) -> float:
-        """Return a setting of a member."""
+        """Return the setting with this name of a member."""
         return self._settings[member if len(self._settings) > 1 else 0, self.plan.run.all_settings.index(name)]
 
     def at(self, members: Int[np.ndarray, "b"], state: RunState) -> StateValues:
-        """Evaluate the conditions of members at states."""
+        """Return the values of the conditions of members at states."""
         t, q, v, *_ = state
         b = len(q)
         numbers = self._with_samples(members, t, self._with_marks(members, state))
@@ -301,7 +305,7 @@ class PhaseCode:
         return self._values
 
     def project(self, members: Int[np.ndarray, "b"], state: RunState) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return q and v of members, projected to the constraints of their phases, and the largest remaining row of Psi_dot."""
+        """Return q and v of members, projected to the constraints of their phases, and the largest remaining |Psi_dot_i|."""
         t, q, v, *_ = state
         n = q.shape[1]
         further = _of(self._of_states, members), _of(self._rows, members), np.zeros((1, 0))
@@ -310,7 +314,7 @@ class PhaseCode:
         return results[:, :n].copy(), results[:, n:-1].copy(), results[:, -1].copy()
 
     def _put_sides(self, numbers: np.ndarray, members: Int[np.ndarray, "b"]):
-        """Put the sides of the comparisons in forces into the numbers of events."""
+        """Put the sides of the comparisons in forces into the numbers of the events of members, in place."""
         for place, side in self.plan.sides_of_events:
             numbers[:, place] = self._joints[members, self._first_side + side]
 
@@ -324,7 +328,7 @@ class PhaseCode:
         return numbers
 
     def _with_samples(self, members: Int[np.ndarray, "b"], t: Float[np.ndarray, "b"], numbers: np.ndarray) -> np.ndarray:
-        """Return the numbers of members with the samples of their times; a run takes all samples instead."""
+        """Return the numbers of members with the samples at their times; only a run takes the samples of all times."""
         if not self._samples:
             return numbers
         numbers, b = _spread(numbers, len(t)).copy(), len(t)
@@ -333,7 +337,7 @@ class PhaseCode:
         return numbers
 
     def _with_marks(self, members: Int[np.ndarray, "b"], state: RunState) -> np.ndarray:
-        """Return the numbers of members, with marks of independent rows, determined where each member enters its phase first."""
+        """Return the numbers of members with marks of independent rows, determined when a member first enters a phase."""
         numbers = self._numbers_of(members, state.phase)
         if self.plan.marking is None:
             return numbers

@@ -59,11 +59,11 @@ class PlainSystem:
     def look(
         self, members: MemberIndices, at: RunState, is_free: bool = False, is_directed: bool = False, has_forces: bool = False
     ) -> StateValues:
-        """Evaluate a state."""
+        """Return the values of the conditions at a state; see `System.look`."""
         return jax.tree.map(lambda x: x[None], self.hybrid.values(without_member(at), is_free, is_directed, has_forces))
 
     def project(self, members: MemberIndices, at: RunState, is_free: bool = False) -> tuple[Array, Array, Array]:
-        """Return q and v projected to the constraints of the phase, and the largest remaining row of Psi_dot over its scale."""
+        """Return q and v projected to the constraints of the phase, and the largest remaining |Psi_dot_i| over its scale."""
         hybrid = self.hybrid
         # A replay without joints that move bodies as they are attached corrects nothing: one step has all derivatives.
         steps = 1 if hybrid.replays and hybrid.plan.has_only_contacts else 2
@@ -79,7 +79,7 @@ class PlainSystem:
         return q[None], v[None], left[None]
 
     def add_joints(self, members: MemberIndices, new: Bool[Array, "1 A"], q: Float[Array, "1 n"], joints: Added) -> Added:
-        """Return the joints that events have added, with new ones, added at q."""
+        """Return `joints` in which the joints that are masked in `new` are added at the positions q."""
         phases, sides = self.hybrid.phases, joints[-1]
         added = (phases.joint_at(i, q[0]) for i in range(len(joints) - 1))
         chosen = (
@@ -89,19 +89,19 @@ class PlainSystem:
         return (*chosen, sides)
 
     def sides(self, members: MemberIndices, joints: Added) -> Float[Array, "1 S"]:
-        """Return the sides of the comparisons in forces (1, S): the last entry of `joints`."""
+        """Return all sides (1, S): the last entry of `joints`."""
         return joints[-1][None]
 
     def with_sides(self, members: MemberIndices, joints: Added, sides: Float[Array, "1 S"]) -> Added:
-        """Return `joints` with other sides of the comparisons in forces, their last entry."""
+        """Return `joints` with other sides, their last entry."""
         return (*joints[:-1], sides[0])
 
     def turned(self, members: MemberIndices, k: Int[Array, "1"], at: RunState) -> Float[Array, "1 S"]:
-        """Return the sides of the comparisons in forces (1, S) after event k."""
+        """Return all sides (1, S) after event k at a state."""
         return self.hybrid.turned(without_member(at), k[0])[None]
 
     def when(self, mask: Bool[Array, "1"], change: Change, runs: MemberRuns) -> MemberRuns:
-        """Return the run with a change if the mask is true, else unchanged."""
+        """Return the run after a change if the mask is true, else unchanged."""
         return jax.lax.cond(mask[0], lambda runs: change(runs, None), lambda runs: runs, runs)
 
     def repeat(self, change: Callable[[MemberRuns], MemberRuns], runs: MemberRuns) -> MemberRuns:
@@ -109,7 +109,7 @@ class PlainSystem:
         return jax.lax.while_loop(lambda runs: runs.running[0], change, runs)
 
     def advance(self, runs: MemberRuns, members: MemberIndices) -> MemberRuns:
-        """Integrate the next window, or the part of it in which all crossings are certain."""
+        """Return the run after its next window, or after the part of the window in which all crossings are certain."""
         watched = self.plan.watched(runs.phase, runs.carried, jnp)[0]
         state = without_member(runs.state(None))
         end = advance_window(

@@ -33,7 +33,7 @@ OUTPUTS = 32  # per piece
 
 
 def run_events(hybrid: Hybrid, conditions: Conditions | None) -> EventRun:
-    """Run a system with events. Smooth results have first derivatives, forward and reverse.
+    """Run a system with events. Times and states of the result have first derivatives, forward and reverse.
 
     Args:
         hybrid: the system.
@@ -45,12 +45,12 @@ def run_events(hybrid: Hybrid, conditions: Conditions | None) -> EventRun:
 
 
 def hybrid_plan(fixed: "FixedPart") -> EventPlan:
-    """Return the plan of a system."""
+    """Return the plan of the events of a system."""
     return jax.tree.unflatten(fixed.tree, [None] * fixed.tree.num_leaves).plan
 
 
 class FixedPart(eqx.Module):
-    """Everything in a `Hybrid` except its numbers."""
+    """Everything in a `Hybrid` except its numbers, and the conditions of its events for machine code."""
 
     rest: PyTree
     tree: TreeDef = eqx.field(static=True)
@@ -95,7 +95,7 @@ def _(primals, tangents):
 
 @jax.custom_jvp
 def _zero(x: Array) -> Float[Array, ""]:
-    """Return zero with derivatives, which are zero, too."""
+    """Return a zero that JAX differentiates with respect to x; its derivatives are zero, too."""
     return jnp.zeros(())
 
 
@@ -106,7 +106,7 @@ def _(primals, tangents):
 
 @jax.custom_jvp
 def _differentiate_once(x: Array) -> Array:
-    """Return x, without second derivatives: those of jumps of the velocities or the constraints are not computed."""
+    """Return x; its derivatives raise an error, since second derivatives of jumps of velocities or constraints are missing."""
     return x
 
 
@@ -162,11 +162,11 @@ def _(primals, tangents):
 
 
 class PieceStart(NamedTuple):
-    """The state in which a piece of a run begins."""
+    """The state in which a piece of a run begins. A piece ends at the next event, or where it has no room for more outputs."""
 
     state: RunState
-    written: Int[Array, ""]  # outputs so far
-    event: Int[Array, ""]  # the next event
+    written: Int[Array, ""]  # number of outputs so far
+    event: Int[Array, ""]  # index of the next event in the run
     shift: Float[Array, ""]  # the change d of the time of the last event
 
 
@@ -188,10 +188,10 @@ def _replay(fixed: FixedPart, xs: Sequence[Array], found: EventRun, zero: Float[
 
 
 def replay(hybrid: Hybrid, found: EventRun, zero: Float[Array, ""]) -> tuple[Array, ...]:
-    """Return the smooth results of a run with their first derivatives: the first fields of `EventRun`.
+    """Return the smooth results of a run, the first fields of `EventRun`, with their first derivatives.
 
-    States at the start have the derivatives of `zero`: JAX otherwise differentiates the loop twice, first for a loop whose first
-    state has none.
+    The run is integrated again, from event to event of the run `found`. States at the start have the derivatives of `zero`: JAX
+    otherwise differentiates the loop twice, first for a loop whose first state has none.
     """
     hybrid = replace(hybrid, replays=True)
     system = PlainSystem(hybrid)
@@ -231,7 +231,7 @@ def replay(hybrid: Hybrid, found: EventRun, zero: Float[Array, ""]) -> tuple[Arr
 def _integrate_piece(
     system: PlainSystem, ts: Float[Array, "T"], found: EventRun, width: int, start: PieceStart
 ) -> tuple[PieceStart, PieceOutput]:
-    """Integrate to the next event, or until the space for outputs is full, and apply the event."""
+    """Integrate to the next event, which is then applied, or until there is no room for more outputs."""
     hybrid, (state, written, event, shift) = system.hybrid, start
     T, K = len(ts), len(found.event_time)
     output = written + np.arange(width)
@@ -335,7 +335,7 @@ def _moved(hybrid: Hybrid, state: RunState, d: Float[Array, ""], a: Float[Array,
 
 
 def _no_event(n: int, K: int) -> tuple[Array, Array, Array, Array]:
-    """Return an index, a time and states as placeholders for a missing event."""
+    """Return an index beyond the K events, a time and states as placeholders for a missing event."""
     return jnp.array(K), jnp.zeros(()), jnp.zeros((2, n)), jnp.zeros((2, n))
 
 

@@ -32,7 +32,7 @@ MOST_OUTPUTS = 32  # output times of a window
 
 
 class Window(NamedTuple):
-    """The next window of a run, and the results of the windows before."""
+    """The next window of a run, and facts about the windows before it."""
 
     reach: Float[Any, ""]  # its largest length (s)
     event: Int[Any, ""]  # the condition whose crossing is being located, or `NO_EVENT`
@@ -53,21 +53,21 @@ class WindowUnits(NamedTuple):
 
 
 class WatchedConditions(NamedTuple):
-    """Conditions and forces (2E) that a window watches: the last side of zero of each, and the scales of the conditions."""
+    """The conditions and forces (2E) that a window watches, with their last sides of zero and the scales of the conditions."""
 
     sides: Int[Any, "2E"]  # the last side of zero of each condition, and of each force
     scale: Float[Any, "E"]
-    watched: Bool[Any, "2E"]
+    watched: Bool[Any, "2E"]  # mask of those that are watched
 
 
 class WindowMotion(Protocol):
-    """The motion of one member.
+    """The interface between windows and the motion of one member.
 
     Attributes:
         xp: jax.numpy, or NumPy.
         plan: the phases and events.
-        ts: the output times.
-        units: numbers of the run.
+        ts: the output times (s).
+        units: units and tolerances of the run.
         projects: whether states are projected after each step.
         breakpoints: times (s) where the motion is not smooth; None if there are none.
     """
@@ -99,7 +99,7 @@ class WindowMotion(Protocol):
 
 
 class WindowEnd(NamedTuple):
-    """The end of a window, or of the part of it that is certain."""
+    """The end of a window, or of the part of it in which all crossings are certain; its outputs, and the next window."""
 
     t: Float[Any, ""]
     q: Float[Any, "n"]
@@ -109,10 +109,10 @@ class WindowEnd(NamedTuple):
     goes_on: Bool[Any, ""]
     code: Int[Any, ""]  # the `Result` if the run does not go on
     undefined: Bool[Any, "E"]  # the conditions whose NaN ends the run
-    totals: Int[Any, "5"]
+    totals: Int[Any, "5"]  # as in `EventRun`
     rows: Int[Any, "k"]  # the indices of the outputs; beyond the last one for times that were not reached
-    outputs: tuple[Float[Any, "k n"], Float[Any, "k n"]]  # their q and v
-    window: Window  # the next one
+    outputs: tuple[Float[Any, "k n"], Float[Any, "k n"]]  # q and v of these outputs
+    window: Window  # the next window
 
 
 def first_window(ts: Float[Any, "T"], t: Any, E: int, xp: ModuleType) -> Window:
@@ -121,7 +121,7 @@ def first_window(ts: Float[Any, "T"], t: Any, E: int, xp: ModuleType) -> Window:
 
 
 def advance_window(motion: WindowMotion, window: Window, state: RunState, given: WatchedConditions) -> WindowEnd:
-    """Integrate a window: to its end, to the last node before a certain or possible crossing, or to the crossing itself."""
+    """Integrate over a window: to its end, to the last node before a certain or possible crossing, or to the crossing itself."""
     xp, ts, units, plan, t = motion.xp, motion.ts, motion.units, motion.plan, state.t
     E, T, smallest = plan.count, len(ts), units.smallest
     output = xp.searchsorted(ts, t) + np.arange(min(MOST_OUTPUTS, T))
@@ -223,9 +223,9 @@ def advance_window(motion: WindowMotion, window: Window, state: RunState, given:
 def _change_to_zero(
     plan: EventPlan, given: WatchedConditions, event: Int[Any, ""], g: Float[Any, "E"], rate: Float[Any, "E"], xp: ModuleType
 ) -> tuple[Float[Any, ""], Bool[Any, ""]]:
-    """Return the time (s) from a state to the zero of an event's condition, and whether the condition has not reached zero.
+    """Return the time (s) from a state to the zero of an event's condition, and whether the zero is still ahead.
 
-    The time is zero where the condition is, and for forces and conditions of velocities, whose rates are not known.
+    The time is zero if the condition is zero, and for forces and conditions of velocities, whose rates are not known.
     """
     k = xp.clip(event, 0, len(g) - 1)
     has_rate = (event == k) & ~xp.asarray(plan.by_velocity)[k] & (rate[k] != 0)

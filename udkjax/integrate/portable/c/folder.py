@@ -78,8 +78,8 @@ class ExportedCode(NamedTuple):
     Attributes:
         files: the files.
         prefix: the beginning of the names of all functions.
-        memory: bytes of the memory that each function needs.
-        flops: most operations on numbers of one evaluation of the accelerations.
+        memory: number of bytes of memory that each function needs, by the name of the function in `what`.
+        flops: largest number of operations on numbers in one evaluation of the accelerations.
     """
 
     files: list[Path]
@@ -148,7 +148,10 @@ def export_c(
 
 
 def _clear(folder: Path, names: Collection[str], mark: str) -> None:
-    """Make a folder, and remove the scene's earlier export from it: `cc *.c` would compile its files as well."""
+    """Make a folder, and remove files of earlier exports of the scene from it: `cc *.c` would compile these as well.
+
+    Raise `ArgumentError` if it has a file with one of the `names` that udkjax did not write.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     heads = {file: file.read_bytes()[: len(mark)].decode(errors="replace") for file in folder.glob("*.[ch]") if file.is_file()}
     if foreign := [file.name for file, head in heads.items() if file.name in names and not head.startswith(MARK)]:
@@ -159,7 +162,7 @@ def _clear(folder: Path, names: Collection[str], mark: str) -> None:
 
 
 def scene_files(scene: SceneCode, what: Sequence[str], parameters: Sequence[str]) -> tuple[dict[str, str], dict[str, CUnit]]:
-    """Return the texts of the files of a scene's functions, by name, and the units of the functions."""
+    """Return the texts of the files of a scene by name, and the units of the functions in `what` by their names there."""
     units = {name: FUNCTIONS[name](scene) for name in FUNCTIONS if name in what}
     names = scene.parameters(parameters)
     header = _header(scene, {name: unit for name, (_, unit) in units.items()}, names[1])

@@ -1,4 +1,4 @@
-"""The functions of a scene in C: each is a unit of the engine with a call record around it."""
+"""The functions of a scene in C: each calls a unit, the translation of an operation of machine code."""
 
 import re
 from collections.abc import Sequence
@@ -48,6 +48,8 @@ INFO = {name: k for k, name in enumerate(RunStates.info_names)}  # places in the
 class SceneCode:
     """The functions of a scene in C.
 
+    The methods `run` to `reactions` each return the C text of functions, and the unit that these call.
+
     Args:
         mechanism: the scene, with concrete numbers.
         ts: output times of its run (s).
@@ -84,7 +86,7 @@ class SceneCode:
 
     @property
     def n(self) -> int:
-        """Count of coordinates."""
+        """The number of coordinates."""
         return self.operation.code.coordinate_count
 
     @cached_property
@@ -95,13 +97,13 @@ class SceneCode:
 
     @property
     def numbers(self) -> np.ndarray:
-        """All numbers of the scene, marks of rows, and the thresholds of pivots."""
+        """The input "numbers" of a run: all numbers of the scene, marks of rows if any, and two thresholds of pivots."""
         return self.inputs["numbers"]
 
     # --- functions
 
     def run(self) -> tuple[str, CUnit]:
-        """Return `run` and `step`."""
+        """Return the functions of whole runs (`..._run`) and of one interval (`..._step`)."""
         unit, text = self._integration(self.operation)
         text += f"""
 int {self.prefix}_run(const double *numbers, const double *ts, int times, const double *q, const double *v, double *qs,
@@ -113,7 +115,7 @@ int {self.prefix}_run(const double *numbers, const double *ts, int times, const 
         return text, unit
 
     def step_derivatives(self) -> tuple[str, CUnit]:
-        """Return `step` with its derivative along a direction."""
+        """Return the function of one interval with its derivative along a direction (`..._step_along`)."""
         if self.operation.sampled:
             raise ArgumentError("no C for derivatives of steps with tables over time: export the run alone")
         operation = self.operation.with_tangents((True,) * self.operation.code.number_count)
@@ -122,7 +124,7 @@ int {self.prefix}_run(const double *numbers, const double *ts, int times, const 
         return text + self._step("step_along", arguments, ("dnumbers", "dq", "dv"), ("dys", "dend")), unit
 
     def _step(self, name: str, state: str, along: Sequence[str] = (), found: Sequence[str] = ()) -> str:
-        """Return a function that integrates over one interval, with a direction if any is given."""
+        """Return the C of a function that integrates over one interval; `along` and `found` name arrays of a direction."""
         n, further = self.n, "".join(f", {x}" for x in (*along, *found))
         declared = "".join(f", {x}[{4 * n}]" for x in found)
         copied = [f"        memcpy(d{x}, dys + {k * n}, {n} * sizeof *d{x});" for k, x in ((2, "q"), (3, "v")) if along]
@@ -147,7 +149,7 @@ int {self.prefix}_{name}(const double *numbers, double t, double dt, {state}, do
         return dict(zip(self.operation.all_settings, self.inputs["settings"].tolist(), strict=True))
 
     def _integration(self, operation: Operation, along: Sequence[str] = (), found: Sequence[str] = ()) -> tuple[CUnit, str]:
-        """Return the unit of an operation that integrates, and its C with the function `integrate`."""
+        """Return the unit of an operation that integrates, and the C text of it and of a function `integrate` that calls it."""
         unit = c_unit(operation, int(bool(along)))
         rate, length = (number_text(float(x)) for x in (self.analysis.scales.rate, self.analysis.scales.length))
         results = [int(RESULTS.get(k, Result.step_too_small)) for k in range(Status.MISSING_RANK + 1)]
@@ -188,13 +190,13 @@ static int integrate(const double *numbers, const double *ts, int times, const d
         return unit, text
 
     def accelerations(self) -> tuple[str, CUnit]:
-        """Return `accelerations`."""
+        """Return the function of the accelerations at a state (`..._accelerations`)."""
         state = "const double *numbers, double t, const double *q, const double *v"
         head = f"void {self.prefix}_accelerations({state}, double *a, double *memory)"
         return self._of_state(self.evaluation, head, {"found": "a"})
 
     def derivatives(self) -> tuple[str, CUnit]:
-        """Return the accelerations with their derivative along a direction."""
+        """Return the function of the accelerations with their derivative along a direction (`..._accelerations_along`)."""
         _ = self.evaluation  # raises an error for scenes without functions of single states
         operation = self.operation.acceleration_tangents
         head = f"""void {self.prefix}_accelerations_along(const double *numbers, double t, const double *q, const double *v,
@@ -203,13 +205,13 @@ static int integrate(const double *numbers, const double *ts, int times, const d
         return self._of_state(operation, head, {"found": "a", "changes": "da"} | along)
 
     def projection(self) -> tuple[str, CUnit]:
-        """Return `project`."""
+        """Return the function that projects a state to the constraints (`..._project`)."""
         head = f"void {self.prefix}_project(const double *numbers, double t, double *q, double *v, double *memory)"
         copied = f"    memcpy(q, found, {self.n} * sizeof *q);\n    memcpy(v, found + {self.n}, {self.n} * sizeof *v);\n"
         return self._of_state(self.evaluation.projection, head, {"found": "found"}, f"    double found[{2 * self.n}];\n", copied)
 
     def positions(self) -> tuple[str, CUnit]:
-        """Return `close`."""
+        """Return the function that closes positions and velocities near a guess (`..._close`)."""
         n, m = self.n, self.operation.code.row_count
         head = f"double {self.prefix}_close(const double *numbers, double t, double *q, double *v, double *memory)"
         after = f"""    memcpy(q, found, {n} * sizeof *q);
@@ -220,7 +222,7 @@ static int integrate(const double *numbers, const double *ts, int times, const d
         return self._closing(self._close, head, f"    double found[{2 * n}], largest = 0.0;\n", {"state": "found"}, after)
 
     def position_derivatives(self) -> tuple[str, CUnit]:
-        """Return the derivative of `close` along a direction."""
+        """Return the function of the derivative of a closed state along a direction (`..._close_along`)."""
         operation = self._close.with_tangents((True,) * self._close.code.number_count)
         head = f"""void {self.prefix}_close_along(const double *numbers, double t, const double *q, const double *v,
     const double *dnumbers, const double *dq, const double *dv, double *dstate, double *memory)"""
@@ -229,12 +231,12 @@ static int integrate(const double *numbers, const double *ts, int times, const d
 
     @property
     def load_names(self) -> list[tuple[str, str]]:
-        """The constraint and the body of each load."""
+        """The names of the constraint and the body of each load that `reactions` computes."""
         frames = {name: self.mechanism.frames_of(x) for name, x in self.mechanism.constraints.items()}
         return [(name, body) for name, bodies in frames.items() for body in dict.fromkeys(bodies) if body != GROUND]
 
     def reactions(self) -> tuple[str, CUnit]:
-        """Return `reactions`."""
+        """Return the function of the loads of joints and the efforts of drivers (`..._reactions`)."""
         if self.operation.code.rubs:
             why = "give the friction a torque instead of a coefficient, or compute them by udkjax.reactions"
             raise ArgumentError(f"no C for reactions with friction that depends on them: {why}")
@@ -292,7 +294,7 @@ static int integrate(const double *numbers, const double *ts, int times, const d
 
     @property
     def _own_numbers(self) -> np.ndarray:
-        """The numbers of the scene, without marks and thresholds."""
+        """The numbers of the scene, without marks of rows and thresholds of pivots."""
         return NumberProgram(self.mechanism, {}, lambda given: given.without_origin).base
 
     def _of_state(
@@ -318,7 +320,10 @@ static int integrate(const double *numbers, const double *ts, int times, const d
         return unit.text + text, unit
 
     def parameters(self, names: Sequence[str], along: bool = False) -> tuple[str, dict[str, float]]:
-        """Return the function that sets parameters, or that turns their changes into those of the numbers; and their values."""
+        """Return the C text of the function that sets parameters, and the values of these by name.
+
+        If `along`, the function converts changes of the parameters to changes of the numbers instead.
+        """
         values = scalar_parameters(self.mechanism, names)
         program = NumberProgram(self.mechanism, values, lambda given: given.without_origin)
         if any(k >= program.count for k in program.changing):
@@ -335,7 +340,7 @@ static int integrate(const double *numbers, const double *ts, int times, const d
 
 
 def _arrays(**arrays: np.ndarray) -> str:
-    """Return definitions of constant arrays; an empty one has a zero."""
+    """Return definitions of constant arrays in C; an empty one gets a zero, except "samples", which is left out."""
     lines = []
     for name, values in arrays.items():
         if name == "samples" and not values.size:
@@ -345,19 +350,19 @@ def _arrays(**arrays: np.ndarray) -> str:
 
 
 def table(values: np.ndarray) -> str:
-    """Return numbers separated by commas, six in a line."""
+    """Return numbers as a text of C, separated by commas, six in a line."""
     texts = [number_text(float(x)) for x in np.ravel(values)]
     return ",\n    ".join(", ".join(texts[k : k + 6]) for k in range(0, len(texts), 6))
 
 
 def string_text(text: str) -> str:
-    """Return a string in C, in UTF-8."""
+    """Return a text as a string constant of C, in UTF-8."""
     letters = [chr(x) if 32 <= x < 127 and chr(x) not in '"\\?' else f"\\{x:03o}" for x in text.encode()]
     return f'"{"".join(letters)}"'
 
 
 def comment_text(text: str) -> str:
-    """Return a text that can stand in a comment of C."""
+    """Return a text, changed so that it can stand in a comment of C."""
     return text.replace("*/", "* /").replace("/*", "/ *")
 
 

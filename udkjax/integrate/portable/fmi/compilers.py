@@ -35,7 +35,7 @@ def compiler_for(name: str) -> list[str]:
     """Return the command of a C compiler for a platform.
 
     Raises:
-        ArgumentError: there is none, or the platform is unknown.
+        ArgumentError: there is no compiler for the platform, or the platform is unknown.
     """
     if name not in get_args(Platform):
         raise ArgumentError(f"platforms must be among {', '.join(get_args(Platform))}, not {name}")
@@ -47,7 +47,7 @@ def compiler_for(name: str) -> list[str]:
 
 
 def compile_library(command: Sequence[str], name: str, sources: Sequence[Path], to: Path, options: Sequence[str]) -> None:
-    """Compile C to a shared library of a platform.
+    """Compile C to the shared library `to` of the platform `name`.
 
     Raises:
         ArgumentError: the compiler failed; the message has its output.

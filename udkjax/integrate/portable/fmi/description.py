@@ -19,14 +19,14 @@ KINDS = {  # in the order of the schema
 def model_description(
     name: str, prefix: str, token: str, kinds: Sequence[str], variables: FMUVariables, times: Sequence[float], rtol: float
 ) -> str:
-    """Return modelDescription.xml.
+    """Return the text of modelDescription.xml.
 
     Args:
         name: the name of the scene.
         prefix: the model identifier.
         token: the instantiation token.
         kinds: "co-simulation", "model-exchange" or both.
-        variables: the variables.
+        variables: the variables of the FMU.
         times: start and stop time, and the step of the default experiment (s).
         rtol: relative tolerance.
     """
@@ -68,7 +68,7 @@ def model_description(
 
 
 def build_description(prefix: str, sources: Iterable[str]) -> str:
-    """Return sources/buildDescription.xml, by which a tool compiles the FMU."""
+    """Return the text of sources/buildDescription.xml, from which a tool learns how to compile the FMU."""
     files = "".join(f"{_tag('SourceFile', {'name': name})}\n" for name in sources)
     return f"""<?xml version="1.0" encoding="UTF-8"?>
 <fmiBuildDescription fmiVersion="3.0">
@@ -81,7 +81,7 @@ def build_description(prefix: str, sources: Iterable[str]) -> str:
 
 
 def base_unit(unit: str) -> dict[str, str]:
-    """Return the exponents of a unit such as "N m/rad" or "kg m2" in FMI's base units."""
+    """Return the exponents, as strings, of FMI's base units in a unit such as "N m/rad" or "kg m2"."""
     found: dict[str, int] = {}
     for side, sign in zip(unit.split("/"), (1, -1), strict=False):
         for name, exponent in re.findall(r"([A-Za-z]+)(\d*)", side):

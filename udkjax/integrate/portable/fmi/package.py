@@ -43,9 +43,9 @@ class ExportedFMU(NamedTuple):
         file: the FMU.
         kinds: its interfaces.
         platforms: the platforms for which it has a library.
-        outputs: names of outputs.
-        parameters: names of parameters.
-        inputs: names of inputs.
+        outputs: names of its outputs.
+        parameters: names of its parameters.
+        inputs: names of its inputs.
     """
 
     file: Path
@@ -89,8 +89,8 @@ def export_fmu(
         outputs: names of outputs besides the coordinates of bodies, such as "pin.A.x" or "joint.A.angle"; None: positions and
             velocities of all pins that move.
         t0: start of the default experiment (s).
-        t1: its end (s).
-        dt: its step (s).
+        t1: end of the default experiment (s).
+        dt: step of the default experiment (s).
         rtol: relative tolerance of a step, in co-simulation.
         atol: absolute tolerance of a step, in units of the scene's characteristic length and time.
         stiff: whether co-simulation goes on by an implicit method where it is stiff.
@@ -134,7 +134,7 @@ def export_fmu(
 
 
 def _further(scene: SceneCode, kinds: Sequence[str]) -> list[str]:
-    """Return the functions that the FMU needs besides the run."""
+    """Return the names of the C functions (`ALIASES`) that an FMU needs in addition to the run."""
     closing = ["positions"] if scene.analysis.scales.rows.size else []
     if "model-exchange" not in kinds:
         return closing
@@ -146,7 +146,7 @@ def _further(scene: SceneCode, kinds: Sequence[str]) -> list[str]:
 
 
 def _model(scene: SceneCode, variables: FMUVariables, what: Sequence[str], memory: int, kinds: Sequence[str]) -> str:
-    """Return model.h without its end: the constants of the scene for fmu.c."""
+    """Return the text of model.h without its last lines: the constants of the scene for fmu.c."""
     p, big, values = scene.prefix, scene.prefix.upper(), variables.values
     lines = [f"#define {name} {p}_{function}" for key, (name, function) in ALIASES.items() if key in what]
     lines += [f"#define scene_{x} {p}_{x}" for x in ("numbers", "q0", "v0", "set_parameters", "result_name", "step")]
@@ -193,14 +193,14 @@ static const char *const value_names[VALUES + 1] = {{{_texts([*(x.name for x in 
 
 
 def _texts(names: Iterable[str]) -> str:
-    """Return names as constants of C."""
+    """Return names as string constants of C, separated by commas."""
     return ",\n    ".join(map(string_text, names))
 
 
 def _write(
     file: Path, prefix: str, texts: dict[str, str], description: str, commands: dict[str, list[str]], options: Sequence[str]
 ) -> None:
-    """Compile the sources for each platform, and write the archive."""
+    """Compile the sources for each platform, and write the FMU, a zip archive."""
     code = sorted(name for name in texts if name.endswith(".c"))
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)

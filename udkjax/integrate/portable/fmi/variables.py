@@ -30,7 +30,7 @@ POSES = ("position", "angle", "velocity", "angular_velocity")  # of a body: the 
 
 
 class FMUVariable(NamedTuple):
-    """A variable of an FMU: a number with its name and unit, and its value at the start."""
+    """A variable of an FMU, with its start value; None if the value is calculated."""
 
     name: str
     unit: str
@@ -94,7 +94,10 @@ class FMUVariables:
         return [*self.parameters, *self.inputs]
 
     def measure(self) -> Function:
-        """Return `measure(at, found)`: the measures, then their changes, of values, q and v, then the changes of these."""
+        """Return the function `measure(at, found)`, which computes the measures.
+
+        `at` has the values, q and v, then their changes; `found` receives the measures, then their changes.
+        """
         names, n = [x.name for x in self.values], len(self.states)
         length = len(names) + n
 
@@ -125,7 +128,7 @@ def _channels(mechanism: Mechanism, names: Sequence[str] | None, known: Collecti
 
 
 def least_of(mechanism: Mechanism, name: str) -> str:
-    """Return the constant of fmu.c for the values that a parameter may have."""
+    """Return the constant of fmu.c that says which values a parameter may have: ANY_NUMBER, NOT_NEGATIVE or POSITIVE."""
     if not mechanism.must_be_positive(name):
         return "ANY_NUMBER"
     try:
@@ -154,7 +157,10 @@ def _controlled(mechanism: Mechanism) -> list[str]:
 
 
 def _parameters(mechanism: Mechanism) -> dict[str, float]:
-    """Return the scene's parameters but for guesses of poses, and for those that move times where the motion is not smooth."""
+    """Return the parameters of a scene with their values.
+
+    Poses and velocities are left out, as are parameters that move times at which the motion is not smooth.
+    """
     found = scalar_parameters(mechanism)
     values = {k: x for k, x in found.items() if not re.match(rf"body\..*\.({'|'.join(POSES)})(\[|$)", k)}
     values = {k: x for k, x in values.items() if not k.endswith(".velocity") and ".velocity[" not in k}
