@@ -28,9 +28,10 @@ STEPS_PER_ROW = 6  # one step per positive x is usual; the limit stops cycles ca
 
 
 def traced_once(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a function of arrays and then their module, which JAX traces once for each shape.
+    """Return a version of a function of arrays that JAX traces once for each combination of shapes.
 
-    Programs call it wherever they need it, and its machine code is a single function.
+    The result takes the module of the arrays, jax.numpy or NumPy, as its last argument, `xp`. However often a program calls it,
+    its machine code is a single function. For NumPy it is the original function.
     """
     traced = jax.jit(partial(function, xp=jnp))
 
@@ -79,7 +80,7 @@ def solve_complementarity(
         xp: jax.numpy, or NumPy.
 
     Returns:
-        x and y, with derivatives for the final passive set.
+        x, y and the passive set; x and y have derivatives, with this set held fixed.
     """
     equalities = allowed & False if equalities is None else equalities
     size, scaled, rhs = _unit_rows(W, b, allowed | equalities, xp)
@@ -92,22 +93,25 @@ def solve_complementarity(
 def general_complementary_set(
     M: Float[Any, "n n"], q: Float[Any, "n"], takes_part: Bool[Any, "n"], xp: ModuleType = jnp
 ) -> tuple[Bool[Any, "n"], Bool[Any, ""]]:
-    """Return the set of positive x in 0 <= x, y = M x + q >= 0, x y = 0, and whether there is a solution.
+    """Solve 0 <= x, y = M x + q >= 0, x y = 0 by Lemke's method, for an M that need not be symmetric.
 
-    Lemke's method finds a solution for copositive M (Cottle, Pang and Stone 1992). The set has no derivatives.
+    Lemke's method finds a solution for copositive M (Cottle, Pang and Stone 1992).
 
     Args:
-        M: need not be symmetric.
+        M: the matrix.
         q: y for x = 0.
         takes_part: mask of the x that may be positive; all others are zero, whatever y is.
         xp: jax.numpy, or NumPy.
+
+    Returns:
+        A mask of the x that may be positive in the solution, without derivatives; and True if a solution was found.
     """
     reduced, right = xp.where(takes_part & takes_part[:, None], M, np.eye(len(q))), xp.where(takes_part, q, 1.0)
     return _lemke(*((reduced, right) if xp is np else stop_gradients((reduced, right))), xp)
 
 
 class _Tableau(NamedTuple):
-    """The equations y - M x - x0 = q, solved for the basic variables: y, x and x0, in this order."""
+    """The equations y - M x - x0 = q, solved for the basic variables. The variables are numbered in the order y, x, x0."""
 
     table: Any  # (n, 2 n + 2), the last column is the right-hand side
     basic: Any  # (n,)
@@ -176,13 +180,16 @@ def _lemke(M: Float[Any, "n n"], q: Float[Any, "n"], xp: ModuleType) -> tuple[Bo
 def eliminate(
     W: Float[Any, "*m E E"], rows: Bool[Any, "*m E"], least: Float[Any, "*m E"], xp: ModuleType = jnp
 ) -> tuple[Float[Any, "*m E E"], Bool[Any, "*m E"]]:
-    """Return the Schur complement of W after the given rows are eliminated, and a mask of the independent rows among these.
+    """Eliminate rows of W that are independent of each other.
 
     Args:
         W: symmetric, and positive semidefinite.
-        rows: mask of the rows to hold, in this order as far as they are independent.
-        least: bound on the diagonal of the remainder, above which a row is independent of those before.
+        rows: mask of the rows to eliminate, in their order; a row that depends on earlier ones is passed over.
+        least: for each row, the diagonal entry of the remainder above which the row is independent of those before.
         xp: jax.numpy, or NumPy.
+
+    Returns:
+        The remainder of W, its Schur complement, and a mask of the eliminated rows.
     """
     taken, E = rows & False, W.shape[-1]
     for i in range(E) if xp is not np else np.flatnonzero(rows.reshape(-1, E).any(axis=0)):
@@ -195,7 +202,7 @@ def eliminate(
 
 
 def _unit_rows(W: Any, b: Any, rows: Any, xp: ModuleType) -> tuple[Any, Any, Any]:
-    """Return the sizes of the given rows, and W and b with rows of unit size."""
+    """Return the sizes of the masked rows, roots of their diagonal entries (one elsewhere), and W and b in these units."""
     size = xp.sqrt(xp.where(rows, diagonal(W, xp), 1.0))
     return size, W / size[..., None, :] / size[..., :, None], b / size
 

@@ -52,7 +52,10 @@ ROUNDING = 1e-12  # error of y = W x + b, relative to the largest x
 
 
 class RubbingContacts(NamedTuple):
-    """Contacts in an impact: N, F of which have friction. Rows are normal ones first; units are those in which W_ii = 1."""
+    """N contacts in an impact, F of which have friction. Of the R = N + F rows the normal ones come first.
+
+    Units are those in which W_ii = 1.
+    """
 
     W: Float[Any, "*m R R"]
     y: Float[Any, "*m R"]  # speeds before the impact
@@ -95,10 +98,10 @@ class _ImpactLaw(NamedTuple):
 
 
 def rubbing_impact(contacts: RubbingContacts, of_rows: Int[np.ndarray, "F"], xp: ModuleType = jnp) -> Float[Any, "*m R"]:
-    """Return the impulses of an impact; NaN if constraints drive a contact in.
+    """Return the impulses x of an impact; NaN if constraints make a contact penetrate in spite of any impulse.
 
     Args:
-        contacts: the contacts.
+        contacts: the contacts (N), and their state before the impact.
         of_rows: the contact of each row along a line.
         xp: jax.numpy, or NumPy, for which members are treated one after another.
     """
@@ -142,14 +145,17 @@ def _most_parts(law: _ImpactLaw) -> int:
 
 
 def _at_rest(law: _ImpactLaw, state: _Progress) -> _Progress:
-    """Return a state with the present directions of sliding; speeds that count as zero are zero."""
+    """Return a state whose `slides` are the signs of the present speeds of sliding; small speeds are set to zero."""
     xp, N = law.xp, len(law.takes_part)
     speed = xp.where(law.rubs & (xp.abs(state.y[N:]) <= law.zero), 0.0, state.y[N:])
     return state._replace(y=xp.concatenate([state.y[:N], speed]), slides=xp.sign(speed))
 
 
 def _advance(law: _ImpactLaw, state: _Progress) -> _Progress:
-    """Go on up to the next change of the direction of sliding, or to the end of the phase."""
+    """Return the state at the next change of contacts, or at the end of the phase.
+
+    Contacts change if one closes, or stops sliding. If no rates obey the law, the result is the same state with `at_once` set.
+    """
     xp, N, at_once = law.xp, len(law.takes_part), state.at_once
     gap = state.y[:N] - state.remains * state.approach
     closed = law.takes_part & ((gap <= law.zero) | at_once)
@@ -192,21 +198,21 @@ def _advance(law: _ImpactLaw, state: _Progress) -> _Progress:
 
 
 def _end_of_work(before: Any, work: Any, power: Any, xp: ModuleType) -> Any:
-    """Return the positive root of before + work s + power s^2, which begins below zero; infinity if it stays there."""
+    """Return the positive root s of before + work s + power s^2, which is negative at s = 0; infinity if it stays negative."""
     grows = (before < 0) & (work >= 0) & (power > 0)
     a, b, c = (xp.where(grows, x, y) for x, y in ((power, 1.0), (work, 1.0), (before, -1.0)))
     return xp.where(grows, -2 * c / (b + xp.sqrt(b * b - 4 * a * c)), xp.inf)
 
 
 def _rates(law: _ImpactLaw, b: Any, least: Any, slides: Any, closed: Any) -> tuple[Any, Any]:
-    """Return x' with y = W x' + b in complementarity, and whether it obeys the law.
+    """Return the rates x' for which x' and y = W x' + b are complementary, and whether they obey the law of the impact.
 
     Args:
         law: the contacts.
         b: y for x' = 0.
-        least: bounds on normal x'.
-        slides: directions of sliding; where they are 0, y along the line is in complementarity as well.
-        closed: contacts whose normal y is in complementarity; the others have x' = least.
+        least: lower bounds on normal x'.
+        slides: directions of sliding; where they are 0, the rows along the line are complementary, too.
+        closed: mask of the contacts whose normal rows are complementary; the others have x' = least.
     """
     W, xp, N, F = law.W, law.xp, len(closed), len(slides)
     rests = law.rubs & (slides == 0) & (closed | (least > 0))[law.of_rows]
@@ -250,7 +256,7 @@ def _rates(law: _ImpactLaw, b: Any, least: Any, slides: Any, closed: Any) -> tup
 
 
 def _in_modes(law: _ImpactLaw, b: Any, least: Any, equal: Any, direction: Any) -> Any:
-    """Return x for given modes: W x + b = 0 in the rows `equal`, whose x follow the rule for dependent rows."""
+    """Return x for given modes: W x + b = 0 in the rows `equal`; dependent rows among these share x as the module describes."""
     W, xp, N = law.W, law.xp, len(least)
     R = N + len(direction)
     fixed = W if xp is np else stop_gradients(W)

@@ -79,7 +79,7 @@ class Response(NamedTuple):
 
 
 class ContactsAtRest(NamedTuple):
-    """Contacts (E) at one instant; some of them belong to joints that rub in them."""
+    """Contacts (E) at one instant, some of which are those of joints with friction."""
 
     of_joints: Int[np.ndarray, "F"]  # the contact of each joint; -1: the joint is not in a contact
     held: Bool[Any, "*m E"]  # whether each contact is held before the search for modes
@@ -89,7 +89,7 @@ class ContactsAtRest(NamedTuple):
 
     @classmethod
     def none(cls, count: int) -> "ContactsAtRest":
-        """Return the record without contacts, for `count` joints."""
+        """Return the record of no contacts, for `count` joints."""
         nothing = NO_CONTACTS.astype(bool)
         return cls(np.full(count, -1), nothing, nothing, NO_CONTACTS, 0)
 
@@ -122,7 +122,10 @@ class FrictionModes(NamedTuple):
     held: Bool[Any, "*m E"] = NO_CONTACTS.astype(bool)  # contacts at rest
 
     def sides(self, xp: ModuleType) -> Float[Any, "*m F 2"]:
-        """Return the modes as numbers: the direction, and one for a joint at rest, two for one that waits for drivers."""
+        """Return each mode as two numbers: the direction of sliding, and the kind of rest; both are 0 for a locked joint.
+
+        The second number is 1 for a joint that others keep at rest, 2 if the joint waits for drivers, else 0.
+        """
         direction = xp.where(self.locked, 0.0, self.direction)
         return xp.stack([direction, xp.where(self.locked, 0.0, 1.0 * self.at_rest + self.driven)], axis=-1)
 
@@ -176,7 +179,20 @@ class JointsAtRest(NamedTuple):
         xp: ModuleType,
         contacts: ContactsAtRest | None = None,
     ) -> "JointsAtRest":
-        """Return the joints, from W and from the accelerations (*m, F) at unit forces without constraints."""
+        """Return the joints, with W scaled to rows of unit size.
+
+        Args:
+            rest: Mask of the joints whose speeds are zero.
+            sliding: Directions in which the others slide.
+            W: Accelerations of the joints (*m, F, F) at unit forces, with the constraints.
+            mobility: Acceleration of each joint (*m, F) at its own unit force without constraints; a joint cannot move if its
+                diagonal entry of W is negligible compared with this.
+            locked: Mask of the joints that were locked before.
+            rested: Mask of the joints that were at rest before.
+            unit: Size of accelerations that are not zero.
+            xp: jax.numpy, or NumPy.
+            contacts: The contacts; None: there are none.
+        """
         diagonal = xp.diagonal(W, axis1=-2, axis2=-1)
         moves = diagonal > AT_REST.blocked * mobility
         size = xp.sqrt(xp.where(moves, diagonal, 1.0))
@@ -185,11 +201,14 @@ class JointsAtRest(NamedTuple):
         return cls(rest, sliding, W, size, locked, rested, unit, contacts)
 
     def independent(self, wanted: Bool[Any, "*m F"], xp: ModuleType) -> Bool[Any, "*m F"]:
-        """Return a mask of joints among the `wanted` ones whose locks keep all at rest; those locked before are preferred."""
+        """Return a mask of some of the `wanted` joints, whose locks keep all of these at rest.
+
+        Joints that were locked before are preferred.
+        """
         return self._eliminate(wanted, xp)[1]
 
     def _eliminate(self, wanted: Bool[Any, "*m F"], xp: ModuleType) -> tuple[Any, Bool[Any, "*m F"]]:
-        """Return W of all joints once the `independent` ones are locked, and the mask of these."""
+        """Return the mobilities of all joints once the joints that `independent` selects are locked, and the mask of these."""
         remainder, locked = self.W, wanted & False
         least = xp.full(self.W.shape[:-1], AT_REST.carried)
         for preferred in (wanted & self.locked, wanted & ~self.locked):
@@ -205,14 +224,17 @@ class JointsAtRest(NamedTuple):
         is_given: Bool[Any, "*m F"],
         xp: ModuleType,
     ) -> Decision:
-        """Return modes that obey the law.
+        """Search for modes that obey the law of friction, and that of contacts.
 
         Args:
-            respond: evaluates the equations of motion in given modes.
+            respond: solves the equations of motion for given modes.
             direction: the first guess of the direction in which a joint at rest is at its limit; 0: within it.
             departs: the first guess whether others move a joint that is at rest only at this instant.
             is_given: whether the first direction is known to be right.
             xp: jax.numpy, or NumPy.
+
+        Returns:
+            The modes, and whether the search failed.
         """
         F, contacts = self.rest.shape[-1], self.contacts
         E, count = contacts.held.shape[-1], F + contacts.most
@@ -264,7 +286,7 @@ class JointsAtRest(NamedTuple):
             return start
 
         def attempt(state: tuple[_Pivot, Any]) -> tuple[_Pivot, Any]:
-            """Return the pivots after an attempt, with a guess in the masked members, and a mask of members still open."""
+            """Return the state after a search by pivots, from `_guess` in the masked members, and a mask of unsolved members."""
             pivot, guesses = state
             improved = lambda: xp.where(is_given, direction, self._guess(respond, direction, xp))  # noqa: E731
             if xp is not np:
@@ -302,7 +324,7 @@ class JointsAtRest(NamedTuple):
     def _guess(
         self, respond: Callable[[FrictionModes], Response], direction: Float[Any, "*m F"], xp: ModuleType
     ) -> Float[Any, "*m F"]:
-        """Return the direction of each joint at rest at its limit, 0 within it, for approximate limits."""
+        """Return the direction in which each joint at rest is at its limit, 0 within it, by a fixed-point iteration of limits."""
         F, none, mobile = self.rest.shape[-1], self.rest & False, xp.diagonal(self.W, axis1=-2, axis2=-1) > 0
         held, active = self.contacts.held, self.contacts.active(self.contacts.held)
         rest = self.rest & active
@@ -310,7 +332,7 @@ class JointsAtRest(NamedTuple):
         rows = range(F) if xp is not np else np.flatnonzero(acts.reshape(-1, F).any(axis=0)).tolist()
 
         def improve(share: Any) -> Any:
-            """Return the next iterate of the forces, as shares of the limits."""
+            """Return the next iterate of the friction forces, as shares of their limits, from the last one."""
             direction = xp.where(self.rest, share, self.sliding) * active
             found = respond(FrictionModes(none, direction, rest, none, held))
             a, limit = found.accelerations / self.size, self.size * found.forwards
@@ -351,7 +373,10 @@ class JointsAtRest(NamedTuple):
         return at_limit(share)
 
     def _modes(self, pivot: _Pivot, xp: ModuleType) -> FrictionModes:
-        """Return the modes for given joints within their limits; of these, joints with independent rows are locked."""
+        """Return the modes that follow from the other fields of a pivot.
+
+        Of the joints at rest whose forces are within their limits, those with independent rows are locked.
+        """
         active = self.contacts.active(pivot.held)
         rest = self.rest & active
         remainder, locked = self._eliminate(rest & pivot.within, xp)

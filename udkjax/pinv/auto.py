@@ -1,4 +1,4 @@
-"""The default: elimination where it is safe, singular values where it is not."""
+"""The default pseudoinverse: elimination where rows are clearly independent, singular values where they are not."""
 
 import equinox as eqx
 from jaxtyping import Array, Float
@@ -32,7 +32,7 @@ class Auto(Dense):
 
     @property
     def rank_revealing(self) -> SVD:
-        """The method used near singular configurations."""
+        """The pseudoinverse used near singular configurations: the `SVD` with the same threshold."""
         return SVD(self.rank_tol, self.relative)
 
     def factor(self, D: Float[Array, "m n"]) -> SVDFactors:

@@ -17,12 +17,15 @@ from udkjax.pinv.rule import Dense, dot, exceeds
 
 
 def default_rank_tol(dtype: np.dtype) -> float:
-    """Return eps^(1/3): in elimination, the remainder of a row up to this relative length is a rounding error."""
+    """Return eps^(1/3), the default rank tolerance of elimination.
+
+    The remainder of a row counts as a rounding error if its length is at most this fraction of the length of the row.
+    """
     return float(jnp.finfo(dtype).eps) ** (1 / 3)
 
 
 class EliminationFactors(NamedTuple):
-    """D and S, with D^+ = D^T S."""
+    """D and S, with D^+ = D^T S, and the rank of D."""
 
     D: Float[Array, "m n"]
     S: Float[Array, "m m"]
@@ -30,11 +33,11 @@ class EliminationFactors(NamedTuple):
 
 
 class Elimination(Dense):
-    """Eliminate D D^T by its largest pivots; a pivot whose square root is at most the threshold is dropped.
+    """D^+ by elimination of D D^T, the largest pivot first. A row whose pivot has a root up to the threshold is dropped.
 
-    A pivot is compared with its own row: very different sizes of rows, as with very different masses, do no harm. Errors
-    grow as eps cond(D)^2. The default threshold is eps^(1/3): rounding errors of a dependent row are well below it, and pivots
-    below it have lost most of their digits.
+    With `relative=True` the root is compared with the length of its own row: very different sizes of rows, as with very different
+    masses, do no harm. Errors grow as eps cond(D)^2. The default threshold is eps^(1/3): rounding errors of a dependent row are
+    well below it, and pivots below it have lost most of their digits.
     """
 
     def factor(self, D: Float[Array, "m n"]) -> EliminationFactors:
@@ -67,9 +70,15 @@ class Elimination(Dense):
 def _cholesky(
     gram: Float[Array, "m m"], threshold: Float[Array, "m"]
 ) -> tuple[Float[Array, "m m"], Bool[Array, "m"], Int[Array, "m"]]:
-    """Return L with L L^T = gram, by the largest remaining pivot; which pivots exceed their thresholds; and the order of rows.
+    """Factorize gram = L L^T, with the largest remaining pivot at each step.
 
-    L[order] is lower triangular. The column of a dropped pivot is zero.
+    Args:
+        gram: a symmetric, positive semidefinite matrix.
+        threshold: for each row, the pivot at or below which the row is dropped.
+
+    Returns:
+        L, where L[order] is lower triangular and the column of a dropped pivot is zero; a mask of the steps whose pivots exceed
+        their thresholds; and `order`, the row that is eliminated at each step.
     """
     m = len(gram)
 

@@ -8,7 +8,14 @@ from typing import NamedTuple
 def minimum_degree(rows: Sequence[set[int]]) -> list[int]:
     """Order rows by minimum degree, for little fill in D D^T: the row that meets the fewest others comes next.
 
-    Ties go to the row that waits for the fewest earlier rows, then to the first: rows that do not wait can run in parallel.
+    A row waits for the earlier rows that it meets. Ties go to the row that ends the shortest chain of waiting rows, then to the
+    first: rows that do not wait for each other can be eliminated in parallel.
+
+    Args:
+        rows: the columns in which each row has entries.
+
+    Returns:
+        The indices of the rows, in the order of elimination.
     """
     rows_of_column: dict[int, set[int]] = {}
     for i, row in enumerate(rows):
@@ -33,7 +40,10 @@ def minimum_degree(rows: Sequence[set[int]]) -> list[int]:
 
 
 class Fronts(NamedTuple):
-    """Blocks eliminated consecutively by the same operations: fronts of equal sizes."""
+    """Blocks of rows that are eliminated one after another by the same operations.
+
+    A front is a block with the later blocks that it meets; these fronts have equal sizes.
+    """
 
     size: int  # number of rows of each block
     later_sizes: tuple[int, ...]  # numbers of rows of the later blocks that each block meets
@@ -42,9 +52,13 @@ class Fronts(NamedTuple):
 
 
 def order_blocks(sizes: Sequence[int], entries_of_blocks: Sequence[Set[int]]) -> list[Fronts]:
-    """Return an elimination order of least fill, grouped into runs of equal blocks. Two blocks meet if they share an entry.
+    """Return an elimination order of blocks for little fill, grouped into runs of fronts of equal sizes.
 
-    A block waits only for the earlier blocks that it meets. The next run is the largest group of equal blocks that are ready.
+    A block waits only for the earlier blocks that it meets. The next run is the largest group of equal fronts that wait for none.
+
+    Args:
+        sizes: the number of rows of each block.
+        entries_of_blocks: the columns, or bodies, in which each block has entries; two blocks meet if they share one.
     """
     position = {k: i for i, k in enumerate(minimum_degree([set(entries) for entries in entries_of_blocks]))}
     order = sorted(position, key=lambda k: position[k])

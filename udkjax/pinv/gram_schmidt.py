@@ -29,7 +29,11 @@ class GramSchmidt(Orthogonal):
 
 
 def gram_schmidt(D: Float[Array, "m n"], threshold: Float[Array, ""], twice: bool) -> PivotedQR:
-    """Modified Gram-Schmidt; each step uses the column with the largest remainder, until that is at most `threshold`."""
+    """Return the QR of D by modified Gram-Schmidt.
+
+    Each step uses the column with the longest remainder, until that is at most `threshold`. With `twice` the column is
+    orthogonalized again before it is used.
+    """
     rows, columns = D.shape
     steps = min(rows, columns)
     column = jnp.arange(columns)

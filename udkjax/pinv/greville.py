@@ -11,14 +11,17 @@ from udkjax.pinv.rule import Dense, dot, exceeds
 
 
 class GrevilleFactors(NamedTuple):
-    """D^+ itself."""
+    """D^+ itself, and the rank of D."""
 
     plus: Float[Array, "n m"]
     rank: Int[Array, ""]
 
 
 class Greville(Dense):
-    """Given P = D_k^+ of the first k rows, the next row a^T makes it [P - p d^T, p] with d^T = a^T P, c^T = a^T - d^T D_k and
+    """D^+ by Greville's recursion.
+
+    With P = D_k^+ of the first k rows D_k, the pseudoinverse of these and the next row a^T is [P - p d^T, p], where d^T = a^T P,
+    c^T = a^T - d^T D_k and
 
         p = c / (c^T c)            if c is not zero: a is independent of the rows before it,
         p = P d / (1 + d^T d)      if c is zero.
@@ -28,8 +31,8 @@ class Greville(Dense):
     The error is of the order of eps cond(D)^2, because the error of P, eps cond(D) |P|, enters c. The remainder of a dependent
     row is of this order too, while that of an independent row may be as small as 1/cond(D). Hence the default `rank_tol`
     eps^(1/3), where the two are equal; beyond cond(D) = eps^(-1/3) no threshold is right. A dependent row mistaken for
-    independent can make the result wrong by any factor. Rows are taken in their order: cond(D) here is the largest of all first
-    rows together, which is large also where later rows make up for a dependent one.
+    independent can make the result wrong by any factor. Rows are taken in their order: cond(D) here is the largest condition
+    number of the first k rows for any k. It is large also if the first rows are nearly dependent and later ones restore the rank.
     """
 
     def factor(self, D: Float[Array, "m n"]) -> GrevilleFactors:

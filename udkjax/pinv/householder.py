@@ -32,7 +32,7 @@ class Householder(Orthogonal):
 
 
 def pivoted_qr(D: Float[Array, "m n"], threshold: Float[Array, ""]) -> PivotedQR:
-    """Return Householder's QR, in which each step uses the longest remaining column, until that is at most `threshold`."""
+    """Return Householder's QR of D: each step uses the column with the longest remainder, until that is at most `threshold`."""
     q, r, order, rank = complete_qr(D, threshold)
     significant = jnp.arange(len(order)) < rank
     return PivotedQR(
@@ -41,7 +41,7 @@ def pivoted_qr(D: Float[Array, "m n"], threshold: Float[Array, ""]) -> PivotedQR
 
 
 def complete_qr(D: Float[Array, "m n"], threshold: Float[Array, ""]) -> PivotedQR:
-    """Return Householder's QR with the full Q (m, m) and R (m, n).
+    """Return the same QR as `pivoted_qr`, but with the full Q (m, m) and R (m, n).
 
     From `rank` on, the columns of Q span the complement of D's range.
 

@@ -19,10 +19,10 @@ class MatrixFactors(NamedTuple):
 class MatrixPseudoinverse(Dense):
     """Base of pseudoinverses of your own: override `matrix`, which returns D^+.
 
-    It is written in jax.numpy, and never differentiated: all pseudoinverses share one rule of derivatives. Arithmetic, products,
-    reductions, indexing, linear systems, decompositions (`pinv`, `svd`, `qr`, `eigh`), sorting, loops and branches become machine
-    code. With other operations, such as `jax.scipy.linalg.schur`, or with array fields, runs are integrated by diffrax, with the
-    equations in plain JAX.
+    `matrix` is written in jax.numpy, and never differentiated: all pseudoinverses share one rule of derivatives. Arithmetic,
+    products, reductions, indexing, linear systems, decompositions (`pinv`, `svd`, `qr`, `eigh`), sorting, loops and branches
+    become machine code. With other operations, such as `jax.scipy.linalg.schur`, or with array fields, runs are integrated by
+    diffrax, with the equations in plain JAX.
     `self.threshold(D, scale)` is the threshold of the rank, as chosen by `rank_tol` and `relative`.
     """
 

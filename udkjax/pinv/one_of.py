@@ -21,7 +21,7 @@ from udkjax.pinv.varga import Varga
 
 
 class OneOfFactors(NamedTuple):
-    """The factors of each method; zero except for the chosen method."""
+    """The factors of each method: those of the chosen method, and zeros for the others."""
 
     of_each: tuple[Any, ...]
 
@@ -63,7 +63,7 @@ class OneOf(Dense):
 
     @property
     def choices(self) -> tuple[Dense, ...]:
-        """The methods, with the threshold."""
+        """The methods, each with the `rank_tol` and `relative` of this object."""
         return tuple(replace(method, rank_tol=self.rank_tol, relative=self.relative) for method in self.methods)
 
     def factor(self, D: Float[Array, "m n"]) -> OneOfFactors:

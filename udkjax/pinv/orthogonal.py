@@ -10,7 +10,10 @@ from udkjax.pinv.rule import Dense, dot
 
 
 class PivotedQR(NamedTuple):
-    """D = Q R with k = min(m, n): R[:, order] is upper triangular, its diagonal decreasing. From `rank` on, Q and R are zero."""
+    """D = Q R with k = min(m, n): R[:, order] is upper triangular, with a diagonal of decreasing magnitude.
+
+    From `rank` on, the columns of Q and the rows of R are zero; in `complete_qr` Q and R are whole.
+    """
 
     q: Float[Array, "m k"]
     r: Float[Array, "k n"]
@@ -19,7 +22,7 @@ class PivotedQR(NamedTuple):
 
 
 class OrthogonalFactors(NamedTuple):
-    """D^+ = Z Q^T."""
+    """The factors Z and Q of D^+ = Z Q^T, and the rank of D."""
 
     z: Float[Array, "n k"]
     q: Float[Array, "m k"]
@@ -27,7 +30,7 @@ class OrthogonalFactors(NamedTuple):
 
 
 class Orthogonal(Dense):
-    """A method whose factors are Z and Q; one of them is already divided by the triangle."""
+    """A method by QR, D^+ = Z Q^T: one of the factors Z and Q already contains the inverse of the triangle."""
 
     def apply(self, factors: OrthogonalFactors, b: Float[Array, "m"]) -> Float[Array, "n"]:
         return dot(factors.z, dot(factors.q.T, b))
@@ -37,7 +40,7 @@ class Orthogonal(Dense):
 
 
 def divide(t: Float[Array, "k k"], b: Float[Array, "k s"], rank: Int[Array, ""]) -> Float[Array, "k s"]:
-    """Return T^(-1) b, followed by zeros, for the leading triangle T of t of size `rank`.
+    """Return T^(-1) times the first `rank` rows of b, followed by rows of zeros; T is the leading triangle of t of size `rank`.
 
     (LAPACK is avoided: two concurrent batched calls deadlock jax 0.10 on a machine with two cores.)
     """

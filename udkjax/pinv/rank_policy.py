@@ -43,5 +43,5 @@ class RankPolicy(Enum):
 
     @property
     def reports(self) -> bool:
-        """True if a result says that it is not safe."""
+        """True if the output `safe` of programs tells whether their results can be trusted."""
         return self is not RankPolicy.DROP

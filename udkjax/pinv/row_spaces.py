@@ -38,7 +38,7 @@ def echelon(rows: Float[np.ndarray, "R K"], tol: float = SMALLEST_COEFFICIENT) -
 
 
 def connected_columns(relations: Float[np.ndarray, "R K"]) -> list[list[int]]:
-    """Return the sets of columns that rows connect, without columns of zeros."""
+    """Return the sets of columns that rows connect by nonzero entries, as indices; columns of zeros are in none of the sets."""
     nonzero = np.asarray(relations) != 0.0
     _, label = connected_components(nonzero.T.astype(int) @ nonzero, directed=False)
     return [np.flatnonzero(label == k).tolist() for k in np.unique(label[nonzero.any(0)])]

@@ -81,11 +81,11 @@ class Pseudoinverse(PrintsLine):
 
     @abstractmethod
     def admit(self, D: Operator) -> Operator:
-        """Return the operator as arrays; raise an error that names the method if it is not valid."""
+        """Return the operator D as arrays; raise an error that names the method if D is not valid."""
 
     @abstractmethod
     def shape(self, D: Operator) -> tuple[int, int]:
-        """Return (m, n)."""
+        """Return the shape (m, n) of the operator D."""
 
     @abstractmethod
     def matvec(self, D: Operator, x: Float[Array, "n"]) -> Float[Array, "m"]:
@@ -162,7 +162,11 @@ class Dense(Pseudoinverse):
     def threshold(self, D: Float[Array, "m n"], scale: Float[Array, ""], default: float | None = None) -> Float[Array, ""]:
         """Return the threshold at or below which a singular value, or its substitute in this method, counts as zero.
 
-        Without a `rank_tol` it is `default`, else max(m, n) eps: the relative rounding error of a factorization.
+        Args:
+            D: the matrix.
+            scale: the method's scale of D, such as the largest singular value.
+            default: the threshold relative to `scale` if `rank_tol` is None; None: max(m, n) eps, the rounding error of a
+                factorization.
         """
         if self.rank_tol is None:
             return scale * (max(D.shape) * float(jnp.finfo(D.dtype).eps) if default is None else default)
@@ -171,12 +175,15 @@ class Dense(Pseudoinverse):
 
 
 def exceeds(size: Float[Array, "*s"], threshold: Float[Array, ""]) -> Bool[Array, "*s"]:
-    """Return whether a size counts as nonzero. NaN does, so that an invalid matrix results in NaN instead of rank zero."""
+    """Return True where a size exceeds the threshold, and so counts as nonzero.
+
+    NaN counts as nonzero, too, so that an invalid matrix results in NaN instead of rank zero.
+    """
     return ~(size <= threshold)
 
 
 class Plus(eqx.Module):
-    """D^+, or its transpose, as an operator: `plus @ b` for b (m,) or (m, k)."""
+    """D^+, or its transpose, as an operator, with the factors of D: `plus @ b` for b (m,) or (m, k)."""
 
     method: Pseudoinverse
     factors: Factors

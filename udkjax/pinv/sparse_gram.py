@@ -1,4 +1,4 @@
-"""Sparse matrices A by a factorization of A A^T: corrections, the null space, and the smallest singular values.
+"""Computations with sparse matrices A by a factorization of A A^T: corrections, the null space, and the smallest singular values.
 
 All singular values of a dense (m, n) matrix cost O(m n min(m, n)). The Jacobian of a large mechanism is sparse, and only its
 smallest singular values are of interest: block inverse iteration takes a few solves with a sparse factorization. Each value is
@@ -21,18 +21,23 @@ LARGEST_TOL = 1e-6  # of the vector of the largest singular value: the error of 
 
 
 def factor_gram(A: SparseMatrix, damping: float = 0.0) -> Any:
-    """Return a factorization of A A^T + damping, whose method `solve` takes a vector or the columns of a matrix."""
+    """Return a factorization of A A^T + damping I, whose method `solve` takes a vector, or a matrix of right-hand sides."""
     gram = A @ A.T
     return splu(csc_array(gram + damping * eye_array(A.shape[0]) if damping else gram), **_SYMMETRIC)
 
 
 class SmallSingularValues:
-    """The singular values of a sparse matrix that count as zero, and the smallest one that does not.
+    """The smallest singular values of a sparse matrix: all that count as zero, and at least one that does not.
 
     Args:
         A: matrix (m, n), in compressed sparse rows.
         tol: values up to this fraction of the largest count as zero.
         start: left singular vectors of a similar matrix, (m, k), from which fewer iterations are needed.
+
+    Attributes:
+        values: the singular values (k,), in ascending order.
+        vectors: their left singular vectors (m, k).
+        zero_count: the number of values that count as zero.
     """
 
     def __init__(self, A: SparseMatrix, tol: float, start: np.ndarray | None = None):
@@ -74,7 +79,7 @@ class SmallSingularValues:
         return int(np.sum(values <= zero))
 
     def _iterate(self, start: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-        """Return the smallest values, ascending, with one above zero at least, and the left singular vectors (m, k)."""
+        """Return the smallest values in ascending order, at least one of them nonzero, and their left singular vectors (m, k)."""
         random, rows, factor = np.random.default_rng(0), self._rows, factor_gram(self._A, self._damping)
         X = random.standard_normal((rows, min(rows, 1 + SPARE))) if start is None else start
         while True:

@@ -9,7 +9,7 @@ from udkjax.pinv.rule import Dense, dot, exceeds
 
 
 class SVDFactors(NamedTuple):
-    """D^+ = V S^+ U^T."""
+    """The factors of D^+ = V S^+ U^T, and the rank of D."""
 
     u: Float[Array, "m k"]
     inverse: Float[Array, "k"]  # 1/sigma, zero where truncated

@@ -1,4 +1,4 @@
-"""Values without derivatives: choices of step and order, and error estimates."""
+"""Values without derivatives, such as choices of step and order, and error estimates."""
 
 from typing import TypeVar
 

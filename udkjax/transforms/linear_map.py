@@ -45,7 +45,7 @@ class DifferentiableFunction(eqx.Module):
 
     @property
     def orders(self) -> int:
-        """The highest order of derivatives computed by machine code."""
+        """The highest order of derivatives that machine code computes; by default 0: JAX computes all."""
         return 0
 
     @abstractmethod
@@ -53,12 +53,15 @@ class DifferentiableFunction(eqx.Module):
         """Return the shapes of f(x)."""
 
     def forward(self, inputs: list[Array], active: Mask, tangents: list[Array], run: Any) -> list[Array]:
-        """Return J v. `run` is the record that the evaluation of f at x stored for first derivatives; None: it stored none."""
+        """Return J v, with v the `tangents` of the active inputs.
+
+        `run` is the record that the evaluation of f at x stored for first derivatives; None: it stored none.
+        """
         del run
         return change_along(self, inputs, active, tangents)[1]
 
     def backward(self, inputs: list[Array], active: Mask, cotangents: list[Array], run: Any) -> list[Array]:
-        """Return J^T w. `run` is as in `forward`."""
+        """Return J^T w for the active inputs, with w the `cotangents` of the results. `run` is as in `forward`."""
         del run
         return self.pull(inputs, active, cotangents)
 
@@ -74,11 +77,14 @@ class DifferentiableFunction(eqx.Module):
         return change_along(lambda inputs: change_along(self, inputs, active, tangents)[1], inputs, others, other_tangents)[1]
 
     def require_order(self, order: int) -> None:
-        """Raise an error if derivatives of this order by JAX, through a call, would be wrong; by default they are right."""
+        """Raise an error if derivatives of this order that JAX takes of `__call__` would be wrong.
+
+        By default they are right, and nothing happens.
+        """
 
 
 class TangentMap(DifferentiableFunction):
-    """g(x, v) = J(x) v."""
+    """The function g(x, v) = J(x) v of the inputs x, followed by tangents v of the `active` inputs."""
 
     of: DifferentiableFunction
     active: Mask = eqx.field(static=True)
@@ -124,7 +130,7 @@ class TangentMap(DifferentiableFunction):
 
 
 class CotangentMap(TangentMap):
-    """h(x, w) = J(x)^T w."""
+    """The function h(x, w) = J(x)^T w of the inputs x, followed by cotangents w of the results."""
 
     def __call__(self, inputs: list[Array]) -> list[Array]:
         inputs, cotangents = self.parts(inputs)
@@ -155,7 +161,14 @@ class CotangentMap(TangentMap):
 def _by_rows(
     rate: Callable[[list[Array]], list[Array]], inputs: list[Array], active: Mask, cotangents: list[Array]
 ) -> list[Array]:
-    """Return the gradient with respect to e of w^T r(e), for a function r linear in tangents e of x, by all unit vectors."""
+    """Return the gradient of w^T r(e) with respect to e, one array for each active input, by evaluating r at all unit vectors.
+
+    Args:
+        rate: r, a linear function of the tangents e of the active inputs.
+        inputs: x.
+        active: the mask of the active inputs.
+        cotangents: w.
+    """
     shapes = [x.shape for x in select(inputs, active)]
     if not shapes:
         return []
@@ -169,7 +182,7 @@ def _by_rows(
 
 
 def change_along(function: Callable, inputs: list[Array], active: Mask, tangents: list[Array]) -> tuple[Any, Any]:
-    """Return f(x) and its derivative along v, by forward mode."""
+    """Return f(x) and its derivative along v, the `tangents` of the active inputs, by forward mode."""
     return jax.jvp(lambda *active_inputs: function(replaced(inputs, active, active_inputs)), select(inputs, active), tangents)
 
 
@@ -191,7 +204,7 @@ class Linear(eqx.Module):
 
     @property
     def argument_shapes(self) -> list[tuple[int, ...]]:
-        """The shapes of its arguments."""
+        """The shapes of the arguments: tangents of the active inputs or, if `transposed`, cotangents of the results."""
         return self.function.shapes(self.inputs) if self.transposed else [x.shape for x in select(self.inputs, self.active)]
 
     def applied(self, tangents: list[Array]) -> list[Array]:
@@ -237,7 +250,10 @@ _linear_p = linear_primitive("derivative_of_a_run", _apply, _shape, _derivative,
 
 @eqxi.filter_primitive_def
 def _apply_short(linear, vector):
-    """Apply a map if it is machine code; diffrax's loops in other maps are compiled in any case."""
+    """Apply a map outside of compiled programs if machine code computes it; otherwise raise `TooLongError`.
+
+    Other maps contain loops of diffrax, which are compiled in any case.
+    """
     if linear.run is None and linear.function.orders < 1:
         raise TooLongError
     return _apply(linear, vector)

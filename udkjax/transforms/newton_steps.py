@@ -1,4 +1,4 @@
-"""Newton's method of problems whose steps settle their kinks first, and then double the correct digits."""
+"""Newton's method for problems with kinks: steps first find the smooth piece of the solution, then double the correct digits."""
 
 from collections.abc import Callable
 
@@ -17,14 +17,17 @@ def repeated_newton(
     most_steps: int = MOST_STEPS,
     last_change: float = LAST_CHANGE,
 ) -> tuple[Array, Bool[Array, ""]]:
-    """Return the last of at most `most_steps` iterates, and whether the last step still changed it.
+    """Take Newton steps until one of them hardly changes the iterate, or `most_steps` are taken.
 
     Args:
-        step: Returns the next iterate, the size of its change and its own; the change counts beyond `last_change` of the size.
+        step: From an iterate to the next one, the size of the change, and the size of the next iterate.
         start: The first iterate.
-        begins: Whether there are any steps.
+        begins: Whether any steps are taken.
         most_steps: The maximum number of steps.
-        last_change: The largest relative change by a last step.
+        last_change: Steps end after one whose change is at most this fraction of the iterate's size.
+
+    Returns:
+        The last iterate, and True if the last step still changed it by more: the iteration has not converged.
     """
 
     def again(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:

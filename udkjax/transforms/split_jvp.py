@@ -26,9 +26,18 @@ SplitFunction = Callable[..., tuple[list[Array], list[Array]]]  # (point, direct
 def split_jvp(
     seen: SplitFunction, run: SplitFunction, point: PyTree, direction: PyTree, shapes: OutputShapes
 ) -> tuple[list[Array], list[Array]]:
-    """Return the value at `point` and its derivative along `direction`, trees of arrays, by `run`; JAX transforms `seen` instead.
+    """Return the value of a function at a point and its derivative along a direction.
 
-    Both are mapped over any batch. `shapes` are the shapes of the value and of the derivative.
+    Args:
+        seen: (point, direction) -> (value, derivative), which JAX differentiates and linearizes.
+        run: A function with the same results, which compiled programs execute wherever no derivative of `seen` is taken. A batch
+            maps both functions.
+        point: A tree of arrays.
+        direction: A tangent of the point.
+        shapes: The shapes of the value and of the derivative.
+
+    Returns:
+        The value and the derivative, as lists of arrays.
     """
     direction = jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, float) else x, direction)  # a tangent may be 1.0
     (point_arrays, direction_arrays), static = eqx.partition((point, direction), eqx.is_array)
@@ -61,7 +70,7 @@ class SplitForms:
         self.values = len(shapes[0])
 
     def mapped(self, axes: Sequence[int | None], size: int) -> "SplitForms":
-        """Return both forms, batched along the given axes of the arrays, for `size` members."""
+        """Return both forms for a batch of `size` members, along the given axes of the arrays."""
         seen, run = (jax.vmap(f, in_axes=tuple(axes), axis_size=size) for f in (self.seen, self.run))
         value, change = ([jax.ShapeDtypeStruct((size, *x.shape), x.dtype) for x in part] for part in self.shapes)
         direction_types = [
@@ -113,7 +122,10 @@ def _part(trace: Any, *xs: Array, forms: SplitForms) -> list[Array]:
 
 
 def _checkpointed(saveable: Any, unknown: Sequence[bool], instantiated: Sequence[bool], eqn: Any) -> tuple[Any, ...]:
-    """Split under `jax.checkpoint`: if only directions are unknown the value is computed; the backward pass recomputes both."""
+    """Rule of `jax.checkpoint`: if only the direction is unknown, the value is computed at once.
+
+    The backward pass computes both the value and the derivative again.
+    """
     del saveable
     forms: SplitForms = eqn.params["forms"]
     inputs = [x for x, t in zip(eqn.invars, instantiated, strict=True) if not t and not isinstance(x, Literal)]

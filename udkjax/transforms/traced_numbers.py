@@ -62,11 +62,11 @@ def split_numbers(tree: PyTree) -> tuple[TreeOfNumbers, list[Array]]:
 
 
 def select(xs: Sequence[Any], which: Mask) -> list[Any]:
-    """Select the marked entries."""
+    """Return the entries that `which` marks."""
     return [x for x, m in zip(xs, which, strict=True) if m]
 
 
 def replaced(xs: Sequence[Array], active: Mask, active_arrays: Sequence[Array]) -> list[Array]:
-    """Return the arrays with the active ones replaced by `active_arrays`."""
+    """Return the arrays xs with the active arrays replaced by `active_arrays`, in order."""
     values = iter(active_arrays)
     return [next(values) if m else x for x, m in zip(xs, active, strict=True)]

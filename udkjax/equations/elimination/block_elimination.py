@@ -3,7 +3,6 @@
 A diagonal block belongs to one constraint, an off-diagonal block to two constraints that share a body. A front is a block with
 the later blocks that its elimination changes; fronts of the same sizes are eliminated by the same kernel. A row whose pivot does
 not exceed `drop_tol` times its diagonal entry is left out: the reciprocal of its pivot is set to zero.
-
 """
 
 from collections.abc import Callable, Hashable, Iterator, Sequence
@@ -49,14 +48,17 @@ class BlockElimination:
         layout.add_solves()
 
     def place(self, block: int, column: int) -> int:
-        """Return the entry of a block in a column of the table of its group."""
+        """Return the number in a column of the table of a block's group, in the row of the block's element."""
         group, i = self.elements[block]
         return int(group.table[i, column])
 
     # --- programs
 
     def factorize(self, dropping: bool) -> ProgramParts:
-        """Form Psi_q M^(-1) Psi_q^T from the entries in `psi_q` and factorize it, with or without dependent rows."""
+        """Yield loops that form Psi_q M^(-1) Psi_q^T from the entries in `psi_q`, and factorize it.
+
+        With `dropping`, rows with small pivots are left out.
+        """
         yield from self.form()
         yield Reset("nearness", 0, 1)
         yield Reset("trusted", 0, 1, 1.0)
@@ -71,22 +73,22 @@ class BlockElimination:
             yield KernelLoop(self.terms.kernel(key, write), self._front_table(fronts))
 
     def form(self) -> ProgramParts:
-        """Form Psi_q M^(-1) Psi_q^T from the entries in `psi_q`."""
+        """Yield loops that form Psi_q M^(-1) Psi_q^T in `gram` from the entries in `psi_q`."""
         if self._off_diagonal_size:
             yield Reset("gram", self._off_diagonal_start, self._off_diagonal_size)
         yield from self._gram
 
     def solve(self, solve: int = 0) -> ProgramParts:
-        """Compute x = (Psi_q M^(-1) Psi_q^T)^(-1) right, and jt_x = Psi_q^T x."""
+        """Yield loops that compute x = (Psi_q M^(-1) Psi_q^T)^(-1) right and jt_x = Psi_q^T x of a linear system."""
         yield from self.substitute(solve)
         yield from self.terms.jt(solve)
 
     def substitute(self, solve: int, **names: str) -> ProgramParts:
-        """Compute x = (Psi_q M^(-1) Psi_q^T)^(-1) right; `names` renames arrays of the system, such as x="x2"."""
+        """Yield loops that compute x = (Psi_q M^(-1) Psi_q^T)^(-1) right; `names` rename arrays of the system, such as x="x2"."""
         yield from FACTORS.substitute(self.terms, self.order, self._front_table, solve, **names)
 
     def safe(self) -> KernelLoop:
-        """Write `safe`: one if all pivots exceed `safe_tol`, else zero."""
+        """Return the loop that sets `safe`: one if all pivots exceed `safe_tol` times their diagonal entries, else zero."""
 
         def write(w: KernelWriter):
             w.write(w.read("trusted", None), "safe", None)
@@ -94,7 +96,7 @@ class BlockElimination:
         return self.terms.single_iteration("safe", write)
 
     def distance(self) -> KernelLoop:
-        """Write `distance`, the distance from dependence: the root of the smallest pivot relative to its diagonal entry."""
+        """Return the loop that sets `distance` from dependence: the root of the smallest pivot relative to its diagonal entry."""
 
         def write(w: KernelWriter):
             w.write(w.graph.constant(1.0) / w.graph.sqrt(w.read("nearness", None)), "distance", None)
@@ -102,7 +104,7 @@ class BlockElimination:
         return self.terms.single_iteration("distance", write)
 
     def rank(self) -> ProgramParts:
-        """Count the rows that the last factorization retained."""
+        """Yield loops that set `rank` to the number of rows that the last factorization retained."""
         yield Reset("rank", 0, 1)
         for p in sorted(set(self.sizes)):
 
@@ -116,7 +118,7 @@ class BlockElimination:
             yield KernelLoop(self.terms.kernel(("rank", p), count), np.array(blocks)[:, None])
 
     def independent(self) -> ProgramParts:
-        """Write `independent`: one for each row that the last factorization retained, zero for the others."""
+        """Yield loops that set `independent`: one for each row that the last factorization retained, zero for dropped rows."""
         starts: dict[int, list[list[int]]] = {}
         for block, (start, size) in enumerate(zip(self.diagonals, self.sizes, strict=True)):
             starts.setdefault(size, []).append([start, self.place(block, ROW)])
@@ -157,7 +159,7 @@ class BlockElimination:
         return KernelLoop(self.terms.kernel(("diagonal", group), write), table)
 
     def _off_diagonal_blocks(self) -> list[KernelLoop]:
-        """Return the loops over shared bodies that fill the blocks of pairs of constraints, one loop for each kind of pair."""
+        """Return the loops over shared bodies that fill the off-diagonal blocks, one loop for each kind of pair of elements."""
         tables: dict[tuple[ConstraintGroup, int, ConstraintGroup, int], list[list[int]]] = {}
         for (late, late_slot), (early, early_slot), body in self.shared_bodies():
             entries = self.place(late, ENTRIES), self.place(early, ENTRIES)
@@ -167,7 +169,10 @@ class BlockElimination:
         return [KernelLoop(self._product(*key), np.array(table)) for key, table in tables.items()]
 
     def shared_bodies(self) -> Iterator[tuple[tuple[int, int], tuple[int, int], int]]:
-        """Iterate over pairs of coupled blocks, the later one first, each with the slot of a shared body, and that body."""
+        """Iterate over pairs of blocks that share a body: the later block, the earlier one, and the body.
+
+        Each block comes with the index of the body among the bodies of its element.
+        """
         holders: dict[int, list[tuple[int, int]]] = {}  # for each body: its blocks, and its index among the bodies of each
         for block, (group, i) in enumerate(self.elements):
             for slot, body in enumerate(group.bodies[:, i].tolist()):

@@ -27,7 +27,10 @@ class TruncatedPseudoinverse(NamedTuple):
 
     @classmethod
     def of(cls, D: np.ndarray, tol: float, full: bool = False) -> "TruncatedPseudoinverse":
-        """Return the pseudoinverse of a matrix, `full` with all right singular vectors; NaN if the matrix is not finite."""
+        """Return the pseudoinverse of a matrix; NaN if the matrix is not finite.
+
+        Singular values up to `tol` times the largest count as zero. If `full`, `vt` contains all n right singular vectors.
+        """
         if D.shape == (1, 1) and math.isfinite(D[0, 0]) and D[0, 0]:  # of one degree of freedom
             return cls(np.sign(D), 1 / np.abs(D[0]), np.ones((1, 1)), 1)
         if not np.isfinite(D).all():  # for which NumPy raises an error
@@ -49,7 +52,7 @@ class TruncatedPseudoinverse(NamedTuple):
         return self.u @ (self.inverse * (self.vt[: len(self.inverse)] @ b))
 
     def null_space(self, free: int) -> np.ndarray:
-        """Return the right singular vectors (n, free) of the smallest singular values, of a `full` decomposition."""
+        """Return the right singular vectors (n, free) of the smallest singular values; the decomposition must be `full`."""
         return self.vt[len(self.vt) - free :].T
 
 
@@ -64,7 +67,11 @@ class FactoredPseudoinverse(NamedTuple):
 
     @classmethod
     def of(cls, D: np.ndarray, tol: float, with_null_space: bool = False) -> "FactoredPseudoinverse | None":
-        """Return D^+; None if singular values beyond the rank are not rounding errors, or others may be below `tol`."""
+        """Return D^+ by QR; None if the rank is not clear.
+
+        It is clear if D is finite, the dependent rows are combinations of the others up to rounding, and all other singular
+        values are certain to exceed `tol` times the largest.
+        """
         mode = "complete" if with_null_space else "reduced"
         if not D.size or not np.isfinite(D).all():
             return None
@@ -100,12 +107,12 @@ class FactoredPseudoinverse(NamedTuple):
         return (b @ self.Q[:, : self.rank]) @ self.A
 
     def null_space(self, free: int) -> np.ndarray:
-        """Return n - r orthonormal columns (n, free) that span the null space of D."""
+        """Return orthonormal columns (n, free) that span the null space of D, for free = n - r and `with_null_space`."""
         return self.Q[:, len(self.Q) - free :]
 
 
 def _bound(A: np.ndarray) -> float:
-    """Return an upper bound of the largest singular value, from the sums of the rows and columns, or of all squares."""
+    """Return an upper bound of the largest singular value: the Frobenius norm, or one from the sums of rows and columns."""
     sizes = np.abs(A)
     return math.sqrt(min(float(np.vdot(A, A)), float(sizes.sum(0).max() * sizes.sum(1).max())))
 
@@ -118,8 +125,8 @@ def dense_pseudoinverse(
     Args:
         D: a matrix (m, n), in units in which its rows are comparable.
         tol: the rank tolerance.
-        free: number of columns of `null_space` that will be asked for; None: of none.
-        with_values: whether the reciprocals of the singular values are needed, `inverse`.
+        free: number of columns of `null_space` that will be asked for; None: `null_space` is not needed.
+        with_values: whether `inverse`, the reciprocals of the singular values, is needed: a `TruncatedPseudoinverse` has it.
     """
     found = FactoredPseudoinverse.of(D, tol, free is not None) if min(D.shape) > FEW_ROWS and not with_values else None
     if found is not None and free in (None, D.shape[1] - found.rank):

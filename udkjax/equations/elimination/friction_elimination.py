@@ -63,7 +63,10 @@ LARGE_CORRECTION = 1 / 8
 
 
 class FrictionElimination:
-    """Loops that solve J C (J^T x + G(x)) = b, in arrays added to the layout after those of `symmetric`; `slopes` holds S."""
+    """Loops that solve J C (J^T x + G(x)) = b, in arrays added to the layout after those of `symmetric`.
+
+    `slopes` holds S. Arguments `solve` are numbers of linear systems, and `v` is the name of the array of velocities.
+    """
 
     def __init__(self, terms: SceneTerms, symmetric: BlockElimination):
         self.terms, self._symmetric, self._skew = terms, symmetric, SkewElimination(terms, symmetric)
@@ -82,9 +85,10 @@ class FrictionElimination:
     # --- programs
 
     def settle(self, solve: int, v: str = "v", reports: bool = False) -> ProgramParts:
-        """Replace x of a system, without friction, by x with friction, and jt_x by J^T x + G(x); NaN if x does not settle.
+        """Yield loops that replace x of a system, without friction, by x with friction, and jt_x by J^T x + G(x).
 
-        With `reports` there is one round, `unsettled` tells whether it suffices (see `_unsettled`), and `settled` is x.
+        Both are NaN if x does not settle. With `reports` there is one round only; `unsettled` then tells whether it suffices (see
+        `_unsettled`), and `settled` is x. Without `reports` there are `ROUNDS` rounds.
         """
         yield from self._skew.form_symmetric
         yield from self.sharing.find_null_space()
@@ -95,13 +99,16 @@ class FrictionElimination:
         yield from self._finish(solve, v, reports)
 
     def further(self, solve: int, v: str = "v") -> ProgramParts:
-        """Compute the results of `settle`, with `friction_share` times all friction, by a round that begins at x = `settled`."""
+        """Yield loops that take one more round from x = `settled`, with `friction_share` times all friction.
+
+        Results and reports are those of `settle` with `reports`.
+        """
         yield from self._begin_at_settled(solve)
         yield from self._round(solve, v, reports=True, in_part=True)
         yield from self._finish(solve, v, reports=True, in_part=True)
 
     def settled(self, solve: int, v: str = "v") -> ProgramParts:
-        """Compute the results of `settle` by one round that starts at its solution `settled`, with the factors there."""
+        """Yield loops that take one round from the solution `settled`, with the factors there; results are as in `settle`."""
         yield from self._begin_at_settled(solve)
         yield from self._round(solve, v)
         yield from self._finish(solve, v, reports=False)
@@ -126,7 +133,10 @@ class FrictionElimination:
         yield from self._correct(solve, v, self.substitute, in_part=in_part)
 
     def substitute(self, solve: int, x: int | None = None) -> ProgramParts:
-        """Compute the x of a system, or of the system `x`, from the right-hand side of `solve` with the last factors."""
+        """Yield loops that solve J C (J + S^T)^T x = right with the last factors, for the right-hand side of the system `solve`.
+
+        The result is the x of this system or, if `x` is given, of the system with the number `x`.
+        """
         x = solve if x is None else x
         yield from self._skew.substitute(solve, x=f"x{x}")
         yield from self.sharing.correct(x)
@@ -139,7 +149,10 @@ class FrictionElimination:
         yield from self._jt(solve, checked=True)
 
     def _copy_solution(self, source: str, to: str, if_small: bool = False) -> ProgramParts:
-        """Copy the x of all rows; with `if_small` only if the last correction left a small fraction of the residual."""
+        """Yield loops that copy the x of all eliminated rows from the array `source` to the array `to`.
+
+        With `if_small` they do so only if the last correction was small: see `LARGE_CORRECTION`.
+        """
         for group in self.terms.layout.eliminated:
 
             def write(w: KernelWriter, group: ConstraintGroup = group):
@@ -154,13 +167,13 @@ class FrictionElimination:
             yield KernelLoop(kernel, group.table, {"from": source, "to": to})
 
     def solve(self, solve: int) -> ProgramParts:
-        """Compute x = (J C (J + S^T)^T)^(-1) right with the last factors, and jt_x = (J + S^T)^T x."""
+        """Yield loops that compute x = (J C (J + S^T)^T)^(-1) right with the last factors, and jt_x = (J + S^T)^T x."""
         yield from self.substitute(solve)
         yield from self.sharing.share(solve)
         yield from self._jt(solve, checked=False)
 
     def add_loads(self, solution: int, **names: str) -> ProgramParts:
-        """Add G(x) of a solution, as a function of the state, to jt_x."""
+        """Yield loops that add G(x) of a linear system, as a function of the state and of x, to its jt_x."""
         for group in self.terms.layout.rubbing:
 
             def write(w: KernelWriter, group: ConstraintGroup = group):
@@ -174,7 +187,10 @@ class FrictionElimination:
     def _correct(
         self, solve: int, v: str, substitute: Callable[..., ProgramParts], has_slopes: bool = True, in_part: bool = False
     ) -> ProgramParts:
-        """Replace x by the solution with the last factors and the loads G(x) - S x, or G(x) where the factors have no slopes."""
+        """Yield loops that replace x by a correction: the solution with the last factors and the loads G(x) - S x held fixed.
+
+        `substitute` solves with these factors. If they contain no slopes (`has_slopes` is False), the fixed loads are G(x).
+        """
         terms = self.terms
         yield from self._drag(solve, v, "drag", has_slopes, in_part)
         for group in terms.layout.eliminated:
@@ -191,7 +207,7 @@ class FrictionElimination:
         yield from self.sharing.share(solve)
 
     def _drag(self, solve: int, v: str, to: str, has_slopes: bool = True, in_part: bool = False) -> ProgramParts:
-        """Compute on each body the loads of friction G(x) less their linear part S x; G(x) alone without `has_slopes`."""
+        """Yield loops that compute the loads of friction on each body, G(x) - S x, in `to`; G(x) without `has_slopes`."""
         yield Reset(to, 0, self.terms.layout.coordinate_count)
         for group in self.terms.layout.rubbing:
 
@@ -216,7 +232,11 @@ class FrictionElimination:
             yield self.terms.over_rubbing(("slopes", in_part), group, write, x=self.terms.loads_of(solve), v=v)
 
     def _measure(self, solve: int, v: str, in_part: bool) -> ProgramParts:
-        """Compute squares in the metric of C: `rubbing` of G(x), `left` and `misfit` of its change by two corrections."""
+        """Yield loops that compute squares of loads in the metric of C.
+
+        `rubbing` is the square of G(x), `left` that of the loads that the last correction held fixed, and `misfit` that of the
+        change of these loads by the correction.
+        """
         yield Reset("misfit", 0, 1)
         yield Reset("left", 0, 1)
         yield Reset("rubbing", 0, 1)
@@ -241,7 +261,7 @@ class FrictionElimination:
         yield self.terms.over_bodies("misfit", measure_change)
 
     def _jt(self, solve: int, checked: bool) -> ProgramParts:
-        """Compute jt_x = (J + S^T)^T x; if `checked`, with the rest of G(x), and NaN unless it has settled."""
+        """Yield loops that compute jt_x = (J + S^T)^T x; if `checked`, jt_x = J^T x + G(x), and NaN unless x has settled."""
         yield from self.terms.jt(solve)
         shared = len(self.terms.layout.shared)
         for group in self.terms.layout.rubbing:
@@ -269,20 +289,20 @@ class FrictionElimination:
 
 
 def _in_part(w: KernelWriter, x: Scalar) -> Scalar:
-    """Return `friction_share` times x; zero without friction, also where x, at loads that ran away, is not finite."""
+    """Return `friction_share` times x; zero if the share is zero, even where x is not finite because loads ran away."""
     share, zero = w.read("friction_share", None), w.graph.constant(0.0)
     return where(greater(share, zero), share * x, zero)
 
 
 def _fails(w: KernelWriter) -> Scalar:
-    """Return whether G(x) has not settled, or the determinant of the last factors is negative."""
+    """Return a scalar that is true if G(x) has not settled, or the determinant of the last factors is negative."""
     limit, half = w.read("rubbing", None) * SETTLED**2, w.read("negative", None) * 0.5
     is_odd = greater(half - floor(half), w.graph.constant(0.25))
     return either(greater(w.read("misfit", None), limit), is_odd)
 
 
 def _unsettled(w: KernelWriter) -> Scalar:
-    """Return the sum of one if x is no solution (`_fails`), and of two if pivots are negative."""
+    """Return a scalar: one if x is no solution (`_fails`), else zero, plus two if any pivots are negative."""
     zero, one, two = map(w.graph.constant, (0.0, 1.0, 2.0))
     return where(_fails(w), one, zero) + where(greater(w.read("negative", None), zero), two, zero)
 

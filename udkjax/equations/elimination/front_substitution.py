@@ -38,7 +38,7 @@ class FrontFactors(NamedTuple):
 
     @property
     def columns(self) -> int:
-        """Columns per later block in the table of fronts; as many precede those of the first later block."""
+        """The number of columns of each later block in the table of fronts, and of the columns before the first later block."""
         return 2 if self.is_symmetric else 3
 
     def below(self, a: int) -> int:
@@ -50,13 +50,21 @@ class FrontFactors(NamedTuple):
         return self.below(a) + (0 if self.is_symmetric else 1)
 
     def right(self, a: int) -> int:
-        """Return the column of the right-hand side of the later block a."""
+        """Return the table's column for the right-hand side of the later block a."""
         return self.beside(a) + 1
 
     def substitute(
         self, terms: SceneTerms, order: list[Fronts], table: Callable[[Fronts], np.ndarray], solve: int, **names: str
     ) -> ProgramParts:
-        """Compute x of the system `solve` from its right-hand side; `names` renames arrays of the system, such as x="x2"."""
+        """Yield loops that compute x of a linear system from its right-hand side.
+
+        Args:
+            terms: The terms of the scene.
+            order: The fronts in the order of elimination.
+            table: Returns the table of fronts.
+            solve: Number of the linear system.
+            names: Arrays that replace those of the system, such as x="x2".
+        """
         names = arrays_of_solve(solve) | names
         yield Reset(names["sum"], 0, terms.layout.sizes[names["sum"]])
         for fronts in order:

@@ -40,10 +40,11 @@ SquareMatrix = list[list[Scalar]]
 
 
 class LoadSharing:
-    """Loops for the shares of redundant rows in the loads of joints, in arrays added to the layout; none without such rows.
+    """Loops for the shares of redundant rows in the loads of joints, in arrays added to the layout.
 
-    `null` is N, column by column, its redundant rows first. `null_inverse` is (N^T W^(-2) N)^(-1); `border` is the matrix from
-    N^T W^(-2) x' to z. The arrays `moved_...` are the same as functions of the state, for derivatives.
+    Without such rows the methods yield no loops. `null` is N, column by column, its redundant rows first. `null_inverse` is
+    (N^T W^(-2) N)^(-1); `border` is the matrix that maps N^T W^(-2) x' to z. The arrays `moved_...` are the same as functions of
+    the state, for derivatives. Arguments `null` are "null" or "moved_null"; `solve` are numbers of linear systems.
     """
 
     FIXED = "null", "null_inverse", "border"  # arrays that are held fixed in derivatives
@@ -70,7 +71,7 @@ class LoadSharing:
     # --- at one state
 
     def find_null_space(self) -> ProgramParts:
-        """Compute N, which spans the combinations of rows that balance, with the factors of J C J^T."""
+        """Yield loops that compute N, which spans the null space of J^T, with the factors of J C J^T."""
         if not self._count:
             return
         terms, eliminated = self.terms, self.terms.layout.eliminated
@@ -92,7 +93,7 @@ class LoadSharing:
         yield from self._invert("null")
 
     def find_border(self) -> ProgramParts:
-        """Compute Q with the factors of A, and the matrix from N^T W^(-2) x' to z."""
+        """Yield loops that compute Q with the factors of A, and `border`."""
         if not self._count:
             return
         terms, k = self.terms, self._count
@@ -129,7 +130,7 @@ class LoadSharing:
         yield terms.single_iteration(("border", k), close)
 
     def correct(self, solve: int) -> ProgramParts:
-        """Replace x' of a linear system, its solution with the factors of A, by x_e."""
+        """Yield loops that replace x' of a linear system, its solution with the factors of A, by x_e."""
         if not self._count:
             return
         k, names = self._count, {"x": f"x{solve}", "shares": f"border_shares{solve}"}
@@ -146,7 +147,7 @@ class LoadSharing:
         yield loop._replace(fixed=tuple(self._solutions))
 
     def share(self, solve: int, null: str = "null") -> ProgramParts:
-        """Compute `loads`, x of all rows with the shares of redundant rows, from the solution x_e of the eliminated system."""
+        """Yield loops that compute `loads`, the x of all rows with the shares of redundant rows, from x_e of a linear system."""
         if not self._count:
             return
         k, names = self._count, {"sums": f"sums{solve}", "loads": f"loads{solve}", "x": f"x{solve}", "null": null}
@@ -168,7 +169,7 @@ class LoadSharing:
     # --- as functions of the state
 
     def copy_null_space(self, solve: int) -> ProgramParts:
-        """Copy N for derivatives, and compute the `loads` of a linear system from the copy."""
+        """Yield loops that copy N to `moved_null`, for derivatives, and compute the `loads` of a linear system from the copy."""
         if not self._count:
             return
 
@@ -182,7 +183,7 @@ class LoadSharing:
         yield from self.share(solve, "moved_null")
 
     def move_null_space(self, corrections: int) -> ProgramParts:
-        """Compute N as a function of the state, with derivatives up to the order of the number of corrections."""
+        """Yield loops that compute N as a function of the state; derivatives are right up to the order `corrections`."""
         if not self._count:
             return
         terms, n = self.terms, self.terms.layout.coordinate_count
@@ -229,7 +230,7 @@ class LoadSharing:
     # --- parts
 
     def _add_combination(self, j: int, null: str, replaces: bool = False) -> ProgramParts:
-        """Set the eliminated rows of column j of N to -c, or add -c."""
+        """Yield loops that add -c to the eliminated rows of column j of N, or, with `replaces`, set these rows to -c."""
         for group in self.terms.layout.eliminated:
 
             def write(w: KernelWriter, group: ConstraintGroup = group):
@@ -241,7 +242,7 @@ class LoadSharing:
             yield KernelLoop(kernel, group.table, {"c": f"x{self._null_systems[j]}", "null": null})
 
     def _invert(self, null: str) -> ProgramParts:
-        """Compute N^T W^(-2) N and its inverse."""
+        """Yield loops that compute N^T W^(-2) N and its inverse."""
         k, gram = self._count, f"{null}_gram"
         yield Reset(gram, 0, k * k)
 
@@ -261,7 +262,7 @@ class LoadSharing:
         yield self.terms.single_iteration(("inverse of null products", k), invert, gram=gram, inverse=f"{null}_inverse")
 
     def _sum(self, sums: str, solve: int, null: str) -> ProgramParts:
-        """Compute N^T W^(-2) x."""
+        """Yield loops that compute the array `sums`, N^T W^(-2) x of a linear system."""
         k = self._count
         yield Reset(sums, 0, k)
 
@@ -274,20 +275,23 @@ class LoadSharing:
         yield loop._replace(fixed=("constants",))
 
     def _write_shares(self, w: KernelWriter, matrix: str, sign: float = 1.0) -> None:
-        """Write the product of a square matrix and `sums`."""
+        """Write code that sets `shares` to `sign` times the product of a square matrix and `sums`."""
         k = self._count
         sums = [w.read("sums", None, j) for j in range(k)]
         for i, row in enumerate(_read_square(w, matrix, k)):
             w.write(dot(w.graph, row, sums) * sign, "shares", None, i)
 
     def _read_null(self, w: KernelWriter, group: ConstraintGroup, j: int) -> list[Scalar]:
-        """Read the entries of a column of N that belong to the loads of an element."""
+        """Return the entries of column j of N for the rows of an element that determine its loads."""
         start, shared = j * self._width, group.column(SHARED)
         eliminated = [w.read("null", RIGHT, start + self._count + i) for i in range(len(group.rows))]
         return eliminated + [w.read("null", shared, start + i) for i in range(len(group.shared_rows))]
 
     def _inverse_square(self, w: KernelWriter, start: int) -> Scalar:
-        """Read w^(-2) of the row of a loop; zero for rows that are left out, which have no weight."""
+        """Return w^(-2) of the row at which a loop over rows is; zero for rows that are left out, which have weight zero.
+
+        `start` is the index of the first row of the loop.
+        """
         layout = self.terms.layout
         weight, one = w.read("constants", 0, layout.first_weight + start), w.graph.constant(1.0)
         square = one / (weight * weight)
@@ -311,7 +315,7 @@ class LoadSharing:
 
 
 def _add_falls(w: KernelWriter, group: ConstraintGroup, loads: list[Scalar]) -> None:
-    """Add the accelerations of the bodies of an element by loads to `fall`."""
+    """Write code that adds the accelerations of the bodies of an element under loads on its coordinates to `fall`."""
     for c, load in enumerate(loads):
         if not load.is_zero:
             x = load * compliance(w, c % 3, BODIES + 3 * (c // 3) + BODY_CONSTANTS)
@@ -344,7 +348,7 @@ def _count_negative(w: KernelWriter, pivot: Scalar) -> None:
 
 
 def _inverse(graph: Graph, matrix: SquareMatrix, look: Callable[[Scalar], None] = lambda _: None) -> SquareMatrix:
-    """Return the inverse of a matrix by elimination without pivoting; `look` is called with each pivot."""
+    """Return the inverse of a matrix of scalars by elimination without pivoting; `look` is called with each pivot."""
     k = len(matrix)
     rows = [[*row, *(graph.constant(float(i == j)) for j in range(k))] for i, row in enumerate(matrix)]
     for p in range(k):

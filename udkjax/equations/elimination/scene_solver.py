@@ -1,4 +1,4 @@
-"""Sequences of loops that the programs of a scene share: their linear systems."""
+"""The linear systems of a scene as sequences of loops, which its programs share."""
 
 from collections.abc import Iterable
 
@@ -14,9 +14,10 @@ REFINEMENTS = 2
 
 
 class SceneSolver:
-    """The linear systems of a scene: J M^(-1) J^T x = right with J = Psi_q, by elimination, numbered from zero in each program.
+    """Loops for the linear systems of a scene, J M^(-1) J^T x = right with J = Psi_q, by elimination.
 
-    The `policy` for small pivots concerns the accelerations; corrections leave out rows whose pivots do not exceed `drop_tol`.
+    The systems of each program are numbered from zero. The `policy` for small pivots concerns the accelerations; corrections
+    leave out rows whose pivots do not exceed `drop_tol` times their diagonal entries.
     """
 
     def __init__(self, terms: SceneTerms, policy: RankPolicy):
@@ -27,14 +28,17 @@ class SceneSolver:
 
     @property
     def factorize(self) -> ProgramParts:
-        """The factorization for accelerations, under the policy."""
+        """The loops of the factorization for accelerations, under the policy."""
         return self.elimination.factorize(self.policy.drops)
 
     def accelerating_solve(self, solve: int, v: str = "v", refined_by: int | None = None, reports: bool = False) -> ProgramParts:
-        """Solve the system `solve` with the right-hand side b: x, and jt_x = Psi_q^T x with the friction that depends on x.
+        """Yield loops that solve a system with the right-hand side b for x and jt_x, including friction that depends on x.
 
-        `refined_by` is the number of a system for the corrections of a refined solution. `reports`: friction that is not settled
-        after one round is reported as `unsettled`.
+        Args:
+            solve: Number of the system.
+            v: Array of the velocities.
+            refined_by: Number of a system that serves for iterative refinement; None: the solution is not refined.
+            reports: Whether friction takes one round only, and `unsettled` tells if this suffices.
         """
         yield from self.solve(solve) if refined_by is None else self.refined_solve(solve, refined_by)
         if self.friction is not None:
@@ -42,7 +46,7 @@ class SceneSolver:
 
     @property
     def factorize_dropping(self) -> ProgramParts:
-        """The factorization for corrections, without rows that depend on others."""
+        """The loops of the factorization for corrections, which leaves out rows that depend on others."""
         return self.elimination.factorize(True)
 
     @property
@@ -51,18 +55,18 @@ class SceneSolver:
         return self.elimination.safe() if self.policy.reports else Reset("safe", 0, 1, 1.0)
 
     def position_terms(self, *outputs: str, v: str = "v") -> list[KernelLoop | Reset]:
-        """Return the loops of sines and cosines and of terms that do not depend on forces."""
+        """Return the loops that compute sines and cosines, and outputs that do not depend on forces (see `element_terms`)."""
         return [self.terms.sincos(), *self.terms.element_terms(outputs, v)]
 
     @property
     def acceleration_system(self) -> list[KernelLoop | Reset]:
-        """Compute Psi_q, a_F, and b as the right-hand side."""
+        """The loops that compute Psi_q, a_F, and b as the right-hand side of the system 0."""
         return [self.terms.sincos(), *self.terms.free_accelerations("v"), *self.terms.element_terms(("psi_q", "b"))]
 
     def refined_solve(self, solve: int, correction: int) -> ProgramParts:
-        """Solve the system `solve` with iterative refinement (corrected seminormal equations, Bjorck 1987).
+        """Yield loops that solve a system with iterative refinement (corrected seminormal equations, Bjorck 1987).
 
-        The system `correction` has the residual of the first one as its right-hand side.
+        Only jt_x is refined. `correction` is the number of a system for the corrections, whose right-hand side is the residual.
         """
         yield from self.solve(solve)
         for _ in range(REFINEMENTS):
@@ -72,5 +76,5 @@ class SceneSolver:
 
 
 def program(*sequences: Iterable[KernelLoop | Reset]) -> LoopProgram:
-    """Concatenate sequences of loops to a program."""
+    """Return the program of several sequences of loops, one after another."""
     return LoopProgram([loop for loops in sequences for loop in loops])

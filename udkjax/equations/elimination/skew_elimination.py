@@ -42,17 +42,17 @@ class SkewElimination:
 
     @cached_property
     def form_symmetric(self) -> list[KernelLoop | Reset]:
-        """Form J C J^T again: elimination has overwritten it."""
+        """The loops that form J C J^T in `base`, since elimination has overwritten it in `gram`."""
         return [self._renamed(part) for part in self._symmetric.form()]
 
     def factorize(self) -> ProgramParts:
-        """Form the matrix from `base` and `slopes`, and factorize it."""
+        """Yield loops that form the matrix from `base` and `slopes`, and factorize it."""
         yield from self._assemble
         yield Reset("negative", 0, 1)
         yield from self._factors
 
     def substitute(self, solve: int, **names: str) -> ProgramParts:
-        """Compute x = (J C (J + S^T)^T)^(-1) right; `names` renames arrays of the system, such as x="x2"."""
+        """Yield loops that compute x = (J C (J + S^T)^T)^(-1) right; `names` rename arrays of the system, such as x="x2"."""
         yield from FACTORS.substitute(self.terms, self._symmetric.order, self._front_table, solve, **names)
 
     # --- the matrix
@@ -65,7 +65,7 @@ class SkewElimination:
 
     @cached_property
     def _assemble(self) -> list[KernelLoop | Reset]:
-        """Form the matrix from `base` and the slopes."""
+        """The loops that form the matrix from `base` and `slopes`."""
         return [*self._copies(), *self._diagonal_changes(), *self._off_diagonal_changes()]
 
     def _copies(self) -> ProgramParts:
@@ -175,7 +175,11 @@ class SkewElimination:
 def _write_products(
     w: KernelWriter, rows: tuple[ConstraintGroup, int, int, int], columns: tuple[ConstraintGroup, int, int, int], to: int
 ) -> None:
-    """Add J C S of a shared body to a block; a side is a group, the slot of the body, and the bases of entries and slopes."""
+    """Write code that adds the part of J C S that belongs to a shared body to an off-diagonal block.
+
+    `rows` and `columns` are the two constraints of the block: a group, the index of the body among those of an element, and the
+    columns of the table with the start indices of the entries and slopes. `to` is the column with the start index of the block.
+    """
     group, slot, entries, _ = rows
     other, other_slot, _, slopes = columns
     if other.rubbing is None:

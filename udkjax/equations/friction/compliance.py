@@ -30,7 +30,11 @@ COMPLIANCE_TOL = 1e-10
 
 
 def compliance_rows(mechanism: Mechanism, compliances: Mapping[str, NumberLike]) -> Float[Array, "m"]:
-    """Return the compliance of each row; raise `ValueError` for an unknown joint, a wrong number, or a negative one."""
+    """Return the compliance of each row of Psi, zero for joints without one.
+
+    Raises:
+        ValueError: A joint is unknown or has the wrong number of compliances, or one of these is negative.
+    """
     constraints, counts = mechanism.constraints, {}
     for name, _ in analyse(mechanism).row_names:
         counts[name] = counts.get(name, 0) + 1
@@ -49,11 +53,11 @@ def compliance_rows(mechanism: Mechanism, compliances: Mapping[str, NumberLike])
 def sharing(
     D: Float[Array, "m n"], soft: Float[Array, "k"] | None, w: Float[Array, "m"]
 ) -> Callable[[Float[Array, "m"]], Float[Array, "m"]]:
-    """Return the function from multipliers to the equivalent ones of least elastic energy.
+    """Return a function that converts multipliers to those of least elastic energy that have the same effect on the bodies.
 
     Args:
-        D: D with weighted rows; those beyond the first k are rigid.
-        soft: Compliances; None: multipliers stay as they are.
+        D: D with weighted rows; the rows after the first k are rigid.
+        soft: Compliances of the first k rows; None: multipliers stay as they are.
         w: Weights of the rows.
     """
     if soft is None or not len(soft):

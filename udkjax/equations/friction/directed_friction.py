@@ -62,7 +62,7 @@ class DirectedFriction(Friction):
             every: Whether smooth friction becomes directed, too.
 
         Returns:
-            The mechanism, and the joints whose friction is set-valued, in the order of the forces.
+            The mechanism, and the joints whose friction was replaced, in the order of the forces.
         """
         mechanism = mechanism.without_origin
         forces, joints = list(mechanism._forces), []
@@ -77,19 +77,19 @@ class DirectedFriction(Friction):
 
 
 class DirectedMechanism(NamedTuple):
-    """A mechanism whose set-valued friction is directed, and its joints with such friction, F."""
+    """A mechanism whose set-valued friction is directed (`DirectedFriction`), and its F joints with such friction."""
 
     mechanism: Any
     joints: tuple[tuple[str, int], ...]  # the names of the joints, and the indices of their friction among the forces
 
     def with_sides(self, sides: Float[Array, "F 2"]) -> Mechanism:
-        """Return the mechanism in which the directed friction of joint j has the mode sides[j]: direction, and rest."""
+        """Return the mechanism in which the directed friction of joint j has the `DirectedFriction.sides` sides[j]."""
         if not self.joints:
             return self.mechanism
         return eqx.tree_at(lambda m: [m._forces[k].sides for _, k in self.joints], self.mechanism, list(sides))
 
     def sliding_speeds(self, q: Vector, v: Vector) -> Float[Array, "F"]:
-        """Return the speeds of the joints (rad/s, m/s)."""
+        """Return the speeds at which the joints slide (rad/s or m/s), in the order of `joints`."""
         frames, found = rubbing.frames(self.mechanism, q, v), []
         for name, k in self.joints:
             joint = self.mechanism.joints[name]
@@ -99,7 +99,7 @@ class DirectedMechanism(NamedTuple):
     def friction(
         self, sides: Float[Array, "F 2"], multipliers: Callable[[Vector], Float[Array, "m"]], t: Time, q: Vector, v: Vector
     ) -> Float[Array, "n"]:
-        """Return the friction that depends on the loads of joints: see `rubbing.settled_loads`."""
+        """Return the loads (n,) of friction that depends on the loads of joints, in given modes: see `rubbing.settled_loads`."""
         return rubbing.settled_loads(multipliers, self.with_sides(sides), t, q, v)
 
     def units(self, length: NumberLike) -> Float[Array, "F"]:
@@ -111,7 +111,7 @@ class DirectedMechanism(NamedTuple):
     def held_by_drivers(
         self, analysis: Analysis, ts: Float[Array, "T"], q: Float[Array, "T n"], v: Float[Array, "T n"]
     ) -> Bool[Array, "T F"]:
-        """Return which joints the drivers hold at rest: they determine the sliding, and its speed and acceleration are zero.
+        """Return a mask of the joints that drivers hold at rest: constraints determine their sliding, at rate zero.
 
         A driver that comes to rest smoothly takes the speed of a joint to zero and leaves it there: no sign changes. The joint is
         then at rest though it neither reaches a limit of friction nor needs a constraint.
@@ -123,7 +123,7 @@ class DirectedMechanism(NamedTuple):
             v: Velocities (m/s, rad/s).
 
         Returns:
-            A mask of the joints.
+            The mask of the joints at each time: the speed and the acceleration of their sliding are zero.
         """
         scales = analysis.scales
         units, unit = analysis.coordinate_units, self.units(scales.length)

@@ -33,7 +33,7 @@ class LooseFriction(NamedTuple):
 
 @deferred
 def loose_friction(mechanism: Mechanism, t: Time, q: Vector, N: Float[Array, "m k"], scales: Scales) -> LooseFriction:
-    """Return which joints with friction have a load that equilibrium leaves open if the friction of all others is given.
+    """Find the joints with friction whose load equilibrium leaves open, even if the friction of all others is given.
 
     The marks are those of a random motion, in which all joints slide that can.
 
@@ -56,7 +56,7 @@ def loose_friction(mechanism: Mechanism, t: Time, q: Vector, N: Float[Array, "m 
     v = everywhere - root * (plus @ (D @ (everywhere / root)))
 
     def frictions(speeds: Array, multipliers: Array) -> Array:
-        """Return the loads of friction of each joint (j, n), as forces."""
+        """Return the loads of friction of each joint (j, n) in N m: forces are multiplied by L."""
         found = rubbing.single_rubbing_loads(mechanism, t, q, speeds, multipliers / jnp.asarray(scales.rows))
         return jnp.stack(list(found.values())) * unit
 
@@ -69,7 +69,7 @@ def loose_friction(mechanism: Mechanism, t: Time, q: Vector, N: Float[Array, "m 
     slides = jnp.linalg.norm(drags, axis=1) > UNIQUE_TOL * usual
 
     def response(drag: Array) -> Array:
-        """Return the friction that the multipliers in answer to a load cause, if all joints slide."""
+        """Return the size of each joint's friction (j,) that the reactions to a load `drag` (n,) cause, if all joints slide."""
         multipliers = uk.weigh(scales.weights, plus.T @ (plus @ (D @ (root * (drag / unit)))))
         return sizes(everywhere, multipliers * jnp.asarray(scales.rows))
 
@@ -78,6 +78,6 @@ def loose_friction(mechanism: Mechanism, t: Time, q: Vector, N: Float[Array, "m 
 
 
 def _inverse_of_rank(D: Float[Array, "m n"], rank: int) -> Float[Array, "n m"]:
-    """Return the pseudoinverse of D from its largest singular values."""
+    """Return the pseudoinverse of D from its `rank` largest singular values."""
     u, sigma, vt = jnp.linalg.svd(D, full_matrices=False)
     return (vt[:rank].T / sigma[:rank]) @ u[:, :rank].T

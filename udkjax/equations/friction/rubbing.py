@@ -70,7 +70,7 @@ def rubbing_loads(
 def single_rubbing_loads(
     mechanism: Mechanism, t: NumberLike, q: BodyArray, v: BodyArray, multipliers: Float[Array, "m"]
 ) -> dict[str, Float[Array, "n"]]:
-    """Return the loads of each friction that depends on the load of a joint, by the name of the joint; see `rubbing_loads`."""
+    """Return the loads (n,) of each friction that depends on the load of a joint, by the joint's name; see `rubbing_loads`."""
     time, places = jnp.asarray(t, jnp.result_type(float)), frames(mechanism, q, v)
     found: dict[str, Array] = {}
     for name, (joint, own) in _with_multipliers(mechanism, multipliers).items():
@@ -82,7 +82,7 @@ def single_rubbing_loads(
 def terms_of_rubbing(
     mechanism: Mechanism, q: BodyArray, v: BodyArray, multipliers: Float[Array, "m"]
 ) -> dict[str, Float[Array, "3"]]:
-    """Return the speed of sliding s (m/s), mu(s) and the load (N) of the joints with friction that depends on it, by joint."""
+    """Return the speed of sliding s (m/s), mu(s) and the load (N) of each friction that depends on a load, by its joint."""
     places = frames(mechanism, q, v)
     return {
         name: jnp.stack([jnp.asarray(x) for x in joint.friction.terms(joint.joint, own, *(places[b] for b in joint.bodies))])
@@ -115,7 +115,7 @@ def loads_of_friction(
 
 
 def _on_bodies(mechanism: Mechanism, attached: Sequence[str], wrenches: Sequence[Wrench]) -> Float[Array, "n"]:
-    """Return loads on bodies or the ground as loads on all coordinates."""
+    """Return the loads `wrenches` on the frames `attached` as loads on all coordinates; loads on the ground are left out."""
     names, total = mechanism.body_names, jnp.zeros((len(mechanism.body_names), 3))
     for body, wrench in zip(attached, wrenches, strict=True):
         if body != GROUND:
@@ -150,7 +150,7 @@ def settled_multipliers(
     w: Weights = None,
     soft: Float[Array, "m"] | None = None,
 ) -> Float[Array, "m"]:
-    """Return lambda = L(G(lambda)); NaN if friction admits none.
+    """Return the solution of lambda = L(G(lambda)); NaN if friction admits none.
 
     Args:
         mechanism: The scene.
@@ -198,7 +198,7 @@ def settled_loads(
 def settle(
     multipliers: Callable[[Vector], Float[Array, "m"]], mechanism: Mechanism, t: Time, q: Vector, v: Vector
 ) -> Float[Array, "m"]:
-    """Return lambda = L(G(lambda)) by Newton's method; NaN if it does not end.
+    """Solve lambda = L(G(lambda)) by Newton's method; the result is NaN if that does not converge.
 
     Args:
         multipliers: L, from loads (n,) to multipliers (m,); affine.
@@ -216,7 +216,7 @@ def settle(
         return x - multipliers(share * friction(x))
 
     def attempt(x: Array, share: Array, begins: Array) -> tuple[Array, Array, Array]:
-        """Return the last of Newton's iterates with a share of friction, whether it is no solution, and its negative pivots."""
+        """Return the last Newton iterate with a share of friction, True if it fails, and the number of its negative pivots."""
 
         def step(x: Array) -> tuple[Array, Array, Array]:
             def parts(x: Array) -> tuple[Array, tuple[Array, Array]]:

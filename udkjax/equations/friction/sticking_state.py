@@ -69,7 +69,7 @@ class StickingState(eqx.Module):
         return jax.tree.map(lambda x: jnp.where(failed, jnp.nan, x), found)
 
     def modes(self, t: Time, q: Vector, v: Vector) -> tuple[FrictionModes, Bool[Array, ""]]:
-        """Return the modes of the joints, without derivatives, and whether none obey the law."""
+        """Return the modes of the joints, without derivatives, and True if no modes obey the law."""
         return stop_gradients(self)._decide(*stop_gradients((t, q, v)))
 
     def _decide(self, t: Time, q: Vector, v: Vector) -> tuple[FrictionModes, Bool[Array, ""]]:
@@ -117,7 +117,7 @@ class StickingState(eqx.Module):
         return StickingLoads(found[:count], total - loads.force(self.mechanism, t, q, v), by_name), response
 
     def _limits(self, directed: DirectedMechanism, multipliers: Float[Array, "k"]) -> Float[Array, "F"]:
-        """Return the largest forces by which the joints stick."""
+        """Return the largest forces (N, N m) by which the joints with set-valued friction stick, for given multipliers."""
         owners = [name for name, _ in constraints.row_names(self.mechanism)]
         found = []
         for name, k in directed.joints:
@@ -134,7 +134,7 @@ class StickingState(eqx.Module):
 
 
 class _Rows(NamedTuple):
-    """The constraints, and the locks of all joints with set-valued friction: slopes a = drift."""
+    """Rows slopes a = drift: those of the constraints, followed by those that lock each joint with set-valued friction."""
 
     speeds: Float[Array, "F"]  # of the joints, A v
     slopes: Float[Array, "m+F n"]  # Psi_q, and A
@@ -142,19 +142,19 @@ class _Rows(NamedTuple):
 
 
 def sticking_joints(mechanism: Mechanism) -> tuple[str, ...]:
-    """Return the joints with set-valued friction, in the order of the forces."""
+    """Return the names of the joints with set-valued friction, in the order of the forces."""
     return tuple(name for name, _ in DirectedFriction.put_in(mechanism).joints)
 
 
 def known_sticking(mechanism: Any, sticking: Mapping[str, Any] | None) -> Bool[Array, "T F"] | None:
-    """Return which joints stick in a run, if this is known.
+    """Return a mask of the joints that stick in a run, if this is known.
 
     Args:
         mechanism: The scene.
         sticking: `Solution.sticking`; None: it is not known.
 
     Returns:
-        A mask of the joints with set-valued friction, in the order of the forces; None: it is not known, or there are none.
+        A mask over times and joints with set-valued friction, in the order of the forces; None: unknown, or no such joints.
     """
     if not sticking or not mechanism.has_bodies:
         return None

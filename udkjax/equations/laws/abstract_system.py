@@ -39,7 +39,10 @@ HistoryLike: TypeAlias = HasStates | SimpleNamespace  # anything with these attr
 
 
 def times_of(solution: HistoryLike) -> Any:
-    """Return the times (s) at which loads act on the states: zero for all of a `Kinematics` over the values of a driver."""
+    """Return the times (s) at which loads on the states of a solution are evaluated.
+
+    They are all zero for a `Kinematics` over the values of a driver, whose `ts` are these values.
+    """
     return solution.ts if getattr(solution, "values_of", None) is None else np.zeros(np.shape(solution.ts))
 
 
@@ -60,7 +63,7 @@ class AbstractSystem(eqx.Module):
 
     @property
     def textbook(self) -> Any:
-        """The equations of the mechanism or user-defined system itself, not of equations that wrap them."""
+        """The equations of the mechanism or user-defined system itself, for equations that wrap others, too."""
         return self
 
     @property
@@ -70,7 +73,7 @@ class AbstractSystem(eqx.Module):
 
     @property
     def programs_of_rows(self) -> RunPrograms | None:
-        """The programs that find independent rows among all rows."""
+        """The programs that find independent rows among all rows; None if there are none."""
         return None
 
     def size(self, dq: Vector) -> Float[Array, ""]:
@@ -83,7 +86,7 @@ class AbstractSystem(eqx.Module):
 
     @abstractmethod
     def accelerations(self, t: Time, q: Vector, v: Vector) -> Vector:
-        """Return the accelerations a."""
+        """Return the accelerations a (n,)."""
 
     @abstractmethod
     def multipliers(self, t: Time, q: Vector, v: Vector) -> Float[Array, "m"]:
@@ -113,15 +116,15 @@ class AbstractSystem(eqx.Module):
 
     @abstractmethod
     def project(self, t: Time, q: Vector, v: Vector) -> tuple[Vector, Vector]:
-        """Return q and v to the constraint manifold."""
+        """Return q and v projected onto the constraint manifold."""
 
     def tangent_part(self, t: Time, q: Vector, v: Vector, dq: Vector, dv: Vector) -> TangentPart:
-        """Return the parts of small changes of q and v that a projection at q preserves; by default the changes themselves."""
+        """Return the parts of small changes dq and dv that a projection at q preserves; by default the changes themselves."""
         return TangentPart(dq, dv)
 
     @abstractmethod
     def violation(self, t: Time, q: Vector, v: Vector) -> tuple[Float[Array, "m"], Float[Array, "k"]]:
-        """Return Psi and the velocity residuals of all rows."""
+        """Return Psi, and the residuals of velocities in all rows: Psi_dot, and phi if there is one."""
 
     @abstractmethod
     def is_finite(self, t: Time, q: Vector, v: Vector) -> Bool[Array, ""]:
@@ -132,16 +135,19 @@ class AbstractSystem(eqx.Module):
     solves_constraints: ClassVar[bool] = False  # True: dependent coordinates are solved for, so every state is projected
 
     def rates(self, t: Time, q: Vector, v: Vector) -> tuple[Vector, Vector]:
-        """Return the time derivatives of q and v that are integrated."""
+        """Return the time derivatives of q and v that are integrated: by default v and the accelerations."""
         return v, self.accelerations(t, q, v)
 
     def fix_partition(self, t: Time, q: Vector, v: Vector) -> Self:
-        """Return the same system with the partition of coordinates at this state, which stays fixed for one step."""
+        """Return the same system with the partition of coordinates that is chosen at this state, for one step.
+
+        By default there is no partition.
+        """
         return self
 
     @property
     def independent(self) -> Bool[Array, "2n"] | None:
-        """The coordinates and velocities that are integrated and under error control; None: all."""
+        """A mask of the coordinates and velocities that are integrated and under error control; None: all are."""
         return None
 
 
@@ -163,7 +169,7 @@ class ConstrainedRows(AbstractSystem):
 
     @abstractmethod
     def energy(self, t: Time, q: Vector, v: Vector) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        """Kinetic and potential energy (J)."""
+        """Return the kinetic and the potential energy (J)."""
 
     @property
     @abstractmethod
@@ -178,7 +184,7 @@ class ConstrainedRows(AbstractSystem):
     @property
     @abstractmethod
     def row_weights(self) -> Float[Array, "m"]:
-        """The weights that make rows comparable."""
+        """The weights that make rows of different units comparable."""
 
     @property
     @abstractmethod

@@ -32,14 +32,14 @@ class Formulation(PrintsLine):
 
     @abstractmethod
     def formulate(self, equations: AbstractSystem) -> AbstractSystem:
-        """Return the equations of a system, solved by this formulation."""
+        """Return equations of motion that wrap `equations` and compute the accelerations by this formulation."""
 
 
 class PointwiseFormulation(Formulation):
     """Base of formulations of your own, which only change how a is computed at a given state: override `solve`.
 
-    It is written in jax.numpy, and never differentiated. Arithmetic, products, reductions, indexing, linear systems, loops and
-    branches become machine code, also with arrays as fields, if M is diagonal. With other operations, such as
+    `solve` is written in jax.numpy, and never differentiated. Arithmetic, products, reductions, indexing, linear systems, loops
+    and branches become machine code, also with arrays as fields, if M is diagonal. With other operations, such as
     `jnp.linalg.eigh`, runs are integrated by diffrax, with the equations in plain JAX.
     """
 
@@ -48,7 +48,7 @@ class PointwiseFormulation(Formulation):
 
     @abstractmethod
     def solve(self, M: Float[Array, "n n"], F: Vector, A: Float[Array, "m n"], c: Float[Array, "m"]) -> Vector:
-        """Return a of M a + A^T lambda = F, A a = c."""
+        """Return the accelerations a (n,) that satisfy M a + A^T lambda = F and A a = c."""
 
 
 class Augmented(PointwiseFormulation):
@@ -62,8 +62,8 @@ class Augmented(PointwiseFormulation):
     1e16, and steps become ever smaller; so here the result is NaN, and a run ends at once with `Result.not_finite`.
     With a pseudoinverse as `method`, for instance `Augmented(udk.SVD())`, a and lambda are the solution of minimum norm:
     redundant constraints share their forces, and the accelerations are right, also in singular configurations with a consistent
-    right-hand side. Its default `rank_tol` is the square of the usual one: a singular value sigma of D = A M^(-1/2) is about
-    sigma^2 here.
+    right-hand side. The default `rank_tol` of `method` is the square of the usual one: a singular value sigma of D = A M^(-1/2)
+    is about sigma^2 here.
 
     Args:
         method: a pseudoinverse, such as `SVD()`; None: LU with partial pivoting.
@@ -196,7 +196,7 @@ class WrappedSystem(AbstractSystem):
 
 
 class FormulatedSystem(WrappedSystem):
-    """Accelerations by a formulation; projection, and the rows left out in it, are those of the wrapped equations."""
+    """Equations of motion with accelerations by a formulation; projections are those of the wrapped equations."""
 
     equations: AbstractSystem
     formulation: PointwiseFormulation
@@ -213,7 +213,10 @@ class FormulatedSystem(WrappedSystem):
 
 @eqx.filter_custom_jvp
 def _accelerations(formulated: FormulatedSystem, t: Time, q: Vector, v: Vector) -> Vector:
-    """Solve in the scene's units, in which coordinates, rows and masses are of order one: rank tolerances are relative."""
+    """Return the accelerations by the formulation, which is given M, F, A and c in the scene's units.
+
+    There coordinates, rows and masses are of order one, which suits relative rank tolerances.
+    """
     M, F, A, c = formulated.matrices(t, q, v)
     scales = getattr(formulated.equations, "scales", None)
     if scales is None or isinstance(scales, UnitScales):

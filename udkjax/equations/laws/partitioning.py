@@ -36,7 +36,7 @@ class NewtonLimits(NamedTuple):
     most_steps: int = 10  # from the predicted state; three or four are usual
 
     def last_change(self, dtype: DTypeLike) -> float:
-        """Return the largest change, relative to the scales, by a last step: the error after it is of the order of eps."""
+        """Return the largest change, relative to the scales, of a step that may be the last: the remaining error is about eps."""
         return float(np.sqrt(jnp.finfo(dtype).eps))
 
 
@@ -61,7 +61,7 @@ class CoordinatePartitioning(Formulation):
     the same tolerances, which has the same motion.
 
     Args:
-        rank_tol: threshold of dependence, relative to the longest row or the largest singular value; None: `Scales.rank_tol`.
+        rank_tol: threshold of dependence, relative to the longest column or the largest singular value; None: `Scales.rank_tol`.
     """
 
     rank_tol: Float[Array, ""] | None = eqx.field(converter=number_called("rank_tol", optional=True), default=None)
@@ -93,7 +93,7 @@ class PartitionedSystem(WrappedSystem):
         return _accelerations(self.fix_partition(t, q, v), t, q, v)
 
     def rates(self, t: Time, q: Vector, v: Vector) -> tuple[Vector, Vector]:
-        """Return v and a at the state that the independent coordinates and velocities determine."""
+        """Return v and a at the state that the independent coordinates and velocities determine; v is NaN if q is far from it."""
         fixed = self.fix_partition(t, q, v)
         closed, v = _solve_dependent(fixed, t, q, v)
         # A solution farther from the predicted state might be another assembly mode; NaN makes the integrator shorten the step.
@@ -101,7 +101,7 @@ class PartitionedSystem(WrappedSystem):
         return jnp.where(is_near, v, jnp.nan), _accelerations(fixed, t, closed, v)
 
     def project(self, t: Time, q: Vector, v: Vector) -> tuple[Vector, Vector]:
-        """Return q and v, the dependent ones solved from the constraints, the others unchanged."""
+        """Return q and v with the dependent coordinates and velocities solved from the constraints, and the others unchanged."""
         return _solve_dependent(self.fix_partition(t, q, v), t, q, v)
 
     def fix_partition(self, t: Time, q: Vector, v: Vector) -> "PartitionedSystem":
@@ -115,7 +115,7 @@ class PartitionedSystem(WrappedSystem):
         return PartitionedSystem(self.equations, self.formulation, dependent)
 
     def _dependent_columns(self, D: Float[Array, "m n"]) -> Bool[Array, "n"]:
-        """Return the columns that pivoting chooses, as many as are independent."""
+        """Return a mask of the columns that pivoting chooses, as many as are independent."""
         none = jnp.zeros(D.shape[1], bool)
         if not len(D):
             return none
@@ -128,12 +128,12 @@ class PartitionedSystem(WrappedSystem):
 
     @property
     def dependent_coordinates(self) -> Bool[Array, "n"]:
-        """The dependent coordinates of the fixed partition."""
+        """A mask of the dependent coordinates of the fixed partition."""
         return self._fixed[0]
 
     @property
     def dependent_velocities(self) -> Bool[Array, "n"]:
-        """The dependent velocities of the fixed partition."""
+        """A mask of the dependent velocities of the fixed partition."""
         return self._fixed[1]
 
     @property
@@ -148,7 +148,7 @@ class PartitionedSystem(WrappedSystem):
         return self.equations.rank_tol if tol is None else tol
 
     def plus(self, D: Float[Array, "m n"], columns: Bool[Array, "n"]) -> Plus:
-        """Return D^+ of some columns, zero for the others."""
+        """Return the pseudoinverse of the matrix that has only the masked columns of D, and zeros in all others."""
         return SVD(self._tol).plus(jnp.where(columns, D, 0))
 
 

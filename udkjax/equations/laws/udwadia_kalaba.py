@@ -62,7 +62,7 @@ checks_instances(Baumgarte)(require_thresholds)
 
 
 def D(mechanism: Mechanism, t: NumberLike, q: BodyArray, w: Weights = None) -> Float[Array, "m n"]:
-    """Return D = Psi_q M^(-1/2)."""
+    """Return D = Psi_q M^(-1/2), its rows multiplied by w."""
     return weigh(w, constraints.psi_q(mechanism, t, q) * inverse_sqrt_mass(mechanism))
 
 
@@ -102,7 +102,7 @@ def _terms(
     w: Weights,
     friction: Loads = None,
 ) -> _Terms:
-    """Return the terms of a state, with Psi_q and F computed once: programs of derivatives have copies of each."""
+    """Return D, b and a_F at a state. Psi_q and F are computed once, since programs of derivatives would have copies of each."""
     slopes, free = constraints.psi_q(mechanism, t, q), a_F(mechanism, t, q, v, friction)
     missing = drift(mechanism, t, q, v, baumgarte) - slopes @ free
     return _Terms(weigh(w, slopes * inverse_sqrt_mass(mechanism)), weigh(w, missing), free)
@@ -111,7 +111,7 @@ def _terms(
 def drift(
     mechanism: Mechanism, t: NumberLike, q: BodyArray, v: BodyArray, baumgarte: Baumgarte | None = None
 ) -> Float[Array, "m"]:
-    """Return gamma - 2 alpha Psi_dot - beta^2 Psi, which Psi_q a is to be."""
+    """Return gamma - 2 alpha Psi_dot - beta^2 Psi, the right-hand side of the equations Psi_q a = c of the accelerations."""
     found = constraints.gamma(mechanism, t, q, v)
     if baumgarte is not None:
         found = found - 2 * baumgarte.alpha * constraints.psi_dot(mechanism, t, q, v)
@@ -204,7 +204,7 @@ def pseudoinverse(method: Pseudoinverse, D: Float[Array, "m n"]) -> "Plus | Zero
 
 
 class ZeroPseudoinverse(eqx.Module):
-    """D^+ of a matrix without rows."""
+    """D^+ of a matrix D without rows, or the transpose, as an operator that returns zeros."""
 
     shape: tuple[int, ...] = eqx.field(static=True)
 

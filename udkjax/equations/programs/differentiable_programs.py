@@ -27,7 +27,7 @@ SECOND_CORRECTION = ("right2", "sum2", "y2", "x2")
 
 
 class DifferentiableProgram(NamedTuple):
-    """A program, and loops with the same derivative, with respect to all arrays except `NOT_DIFFERENTIATED`.
+    """A program, and loops that have its derivatives, with respect to all arrays except `NOT_DIFFERENTIATED`.
 
     No factorization is differentiated. With M^(-1) = C and J = Psi_q, accelerations (and likewise corrections q - C J^T x) are
 
@@ -40,8 +40,8 @@ class DifferentiableProgram(NamedTuple):
     The loops express this in terms of x1, which is zero and changes by dx. A projection is differentiated where all residuals,
     and hence all terms with residuals as factors, vanish.
 
-    Second derivatives are those of x after two corrections with the same factors, x + (J C J^T)^(-1) (b - J C J^T x): each
-    correction makes derivatives of the next order exact.
+    `parts` have the first derivatives. Second derivatives, by `second_parts`, are those of x after two corrections with the same
+    factors, x + (J C J^T)^(-1) (b - J C J^T x): each correction makes derivatives of the next order exact.
     """
 
     program: LoopProgram
@@ -49,11 +49,11 @@ class DifferentiableProgram(NamedTuple):
     second_parts: Sequence[KernelLoop | Reset]
 
     def derivative(self, fixed: Collection[str] = ()) -> LoopDerivative:
-        """Return the derivative, with additional arrays fixed."""
+        """Return the derivative of `parts`; the arrays `fixed` are constant, in addition to `NOT_DIFFERENTIATED`."""
         return LoopDerivative(self.parts, {*NOT_DIFFERENTIATED, *fixed})
 
     def in_mode(self, mode: str, fixed: Collection[str] = ()) -> LoopProgram:
-        """Return the program of a mode of differentiation, with additional arrays fixed."""
+        """Return the program of a mode of differentiation (`FORWARD`, `REVERSE` or `TWICE`); the arrays `fixed` are constant."""
         if mode == TWICE:
             twice = LoopDerivative(self.second_parts, {*NOT_DIFFERENTIATED, *fixed} - {"x0"})
             return twice.second(SECOND_CORRECTION)
@@ -71,14 +71,14 @@ class DifferentiablePrograms:
     def of(self, *outputs: str) -> DifferentiableProgram:
         """Return the program of one of the outputs `IMPLICIT`, or of the `PROJECTION` of a state on the manifold.
 
-        With accelerations it sets `safe`. The loads of joints with friction have `settled` before.
+        The program of the accelerations also sets `safe`, and starts from the loads of joints with friction in `settled`.
         """
         if outputs not in self._programs:
             self._programs[outputs] = self._projection() if outputs == PROJECTION else self._implicit(*outputs)
         return self._programs[outputs]
 
     def _projection(self) -> DifferentiableProgram:
-        """Compute q1 and v1 of a state on the manifold, where they equal q and v."""
+        """Return the program that computes q1 and v1 of a state on the manifold, where they equal q and v."""
         solver, terms = self._solver, self._solver.terms
         copies = [terms.add(f"{x}1", start=x) for x in ("q", "v", "sines")]
         position = [*terms.element_terms(("psi",), "v", 1), *solver.solve(1), self._correction("q", 1)]
@@ -96,7 +96,10 @@ class DifferentiablePrograms:
         return self._solver.terms.add(f"{x}1", start=x, solution=solve, sign=-1, fixed=("constants",))
 
     def _corrected(self, right: str, **names: str) -> ProgramParts:
-        """Compute x0, with its current value and the derivatives of two corrections, and jt_x0."""
+        """Yield loops that compute x0, with its current value and the derivatives of two corrections, and jt_x0.
+
+        `right` is the output that is the right-hand side; `names` are arrays that replace others, such as q="q1".
+        """
         terms, implicit, friction = self._solver.terms, self._implicit_terms, self._friction(right)
         substitute = self._solver.elimination.substitute if friction is None else friction.substitute
         yield Reset("x0", 0, terms.layout.sizes["x0"])
@@ -113,11 +116,11 @@ class DifferentiablePrograms:
         yield from self._rubbing(right)
 
     def _friction(self, right: str) -> FrictionElimination | None:
-        """Return the friction in the equation with a right-hand side: corrections have none."""
+        """Return the friction in the equation with the right-hand side `right`; None in corrections, or if there is none."""
         return self._solver.friction if right == "b" else None
 
     def _rubbing(self, right: str) -> ProgramParts:
-        """Add the loads of friction to jt_x0."""
+        """Yield loops that add the loads of friction to jt_x0, if the equation with this right-hand side has any."""
         friction = self._friction(right)
         if friction is not None:
             yield from friction.sharing.share(0, "moved_null")
@@ -143,13 +146,13 @@ class DifferentiablePrograms:
 
 
 class ImplicitTerms:
-    """Terms of Psi_q M^(-1) Psi_q^T x = b as functions of the state at a given solution."""
+    """Loops for the terms of Psi_q M^(-1) Psi_q^T x = b as functions of the state, at a given solution x0."""
 
     def __init__(self, terms: SceneTerms):
         self._terms = terms
 
     def residuals(self, output: str, v: str = "v") -> ProgramParts:
-        """Compute right1 = b - Psi_q z and jt_x0 = Psi_q^T x0, with z = M^(-1) Psi_q^T x0 and x0 held fixed."""
+        """Yield loops that compute right1 = b - Psi_q z and jt_x0 = Psi_q^T x0, with z = M^(-1) Psi_q^T x0 and x0 held fixed."""
         yield Reset("jt_x0", 0, self._terms.layout.coordinate_count)
         for group in self._terms.layout.eliminated:
 
@@ -162,7 +165,7 @@ class ImplicitTerms:
             yield self._terms.over_group(("residual", output), group, write, fixed=("x0", "z"), v=v)
 
     def transposed(self, **names: str) -> ProgramParts:
-        """Compute jt_x0 = Psi_q^T x0, with Psi_q as a function of the state."""
+        """Yield loops that compute jt_x0 = Psi_q^T x0, with Psi_q as a function of the state."""
         yield Reset("jt_x0", 0, self._terms.layout.coordinate_count)
         for group in self._terms.layout.eliminated:
 
@@ -172,7 +175,7 @@ class ImplicitTerms:
             yield self._terms.over_group("transposed", group, write, **names)
 
     def difference(self, output: str, solve: int, **names: str) -> ProgramParts:
-        """Compute right = b - Psi_q z of a linear system, with Psi_q and b as functions of the state."""
+        """Yield loops that set the right-hand side of a system to b - Psi_q z, with Psi_q and b as functions of the state."""
         for group in self._terms.layout.eliminated:
 
             def write(w: KernelWriter, group: ConstraintGroup = group):
@@ -183,7 +186,7 @@ class ImplicitTerms:
             yield self._terms.over_group(("difference", output), group, write, right=f"right{solve}", **names)
 
     def correct_solution(self, solve: int) -> ProgramParts:
-        """Replace x0 by x0 + x, with x of a linear system."""
+        """Yield loops that add the solution x of a linear system to x0."""
         for group in self._terms.layout.eliminated:
 
             def write(w: KernelWriter, group: ConstraintGroup = group):

@@ -20,7 +20,7 @@ CLEAR = 0.1  # smallest relative distance from dependent rows: elimination loses
 
 
 class AlongTangent(NamedTuple):
-    """A linearization at rest along a direction u that the constraints allow."""
+    """The linearized equations of motion of a mechanism at rest, along a direction u that the constraints allow."""
 
     u: np.ndarray
     square: float  # u^T M u
@@ -31,13 +31,13 @@ class AlongTangent(NamedTuple):
 
 
 class Eliminated:
-    """Programs of elimination of a mechanism of concrete numbers.
+    """Newton steps and linearizations of a mechanism with concrete numbers, by elimination.
 
     Args:
         kind: the structure of the mechanism.
         numbers: its numbers as a vector.
         redundant_rows: rows of Psi that are left out.
-        length: bodies of 1 kg with this radius of gyration (m) replace those of the mechanism; None: none do.
+        length: radius of gyration (m) of bodies of 1 kg, which replace those of the mechanism; None: its own masses count.
     """
 
     def __init__(self, kind: Structure, numbers: np.ndarray, redundant_rows: tuple[int, ...], length: float | None):
@@ -45,12 +45,15 @@ class Eliminated:
         self._arrays: SceneArrays[np.ndarray] | None = None
 
     def newton_step(self, t: float, q: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-        """Return q after the smallest step to Psi = 0, and Psi of all rows before it; None if another method is needed."""
+        """Return q after a Newton step to Psi = 0, the smallest in the metric of M, and Psi of all rows before the step.
+
+        None if singular values are needed: programs are not prepared, or rows are not clearly independent.
+        """
         found = (arrays := self._prepared()) and arrays.newton_step(t, q)
         return None if not found or not found[2] > CLEAR else found[:2]
 
     def linearization(self, t: float, q: np.ndarray, direction: np.ndarray) -> "AlongTangent | None":
-        """Return the linearization at rest along the tangent part of a direction; None if another method is needed."""
+        """Return the linearization at rest along the tangent part of a direction; None as in `newton_step`."""
         found = (arrays := self._prepared()) and arrays.linearization(t, q, direction)
         if not found or not found["distance"][0] > CLEAR:
             return None
@@ -58,7 +61,7 @@ class Eliminated:
         return AlongTangent(found["dq1"], square, stiffness, damping, found["dv"], -found["multipliers"])
 
     def _prepared(self) -> SceneArrays[np.ndarray] | None:
-        """Return the programs; None until preparing them pays off."""
+        """Return the programs with their arrays; None until `WORTH` answers for this structure have been asked for."""
         if self._arrays is None:
             if len(self._uses) < WORTH:
                 self._uses.append(0)

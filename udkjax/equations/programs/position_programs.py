@@ -128,7 +128,7 @@ class PositionPrograms:
         return [x for value, slope in zip(values, slopes, strict=True) for x in (value, *slope)]
 
     def _slopes(self) -> list[list[Scalar]]:
-        """Return dg/ds and dg/dx, with a linear solve for each measure or, if there are fewer, for each number."""
+        """Return dg/ds and dg/dx of each measure, by linear solves: for each measure or, if these are fewer, for s and each x."""
         graph, parameters = self._graph, [self._s, *self._x]
         differential = Differential(graph, self._measures, [*parameters, *self._q])
         zero = graph.constant(0.0)
@@ -175,7 +175,10 @@ class PositionPrograms:
         return determinant
 
     def _find_transmission(self) -> tuple[Scalar, list[Scalar]]:
-        """Return the transmission tau and its derivatives for s, x and q: d log tau = tr(B^+ dB) - sum_j b_j db_j / |b_j|^2."""
+        """Return the transmission tau, and its derivatives with respect to s, x and q.
+
+        With the columns b_j of B, d log tau = tr(B^+ dB) - sum_j b_j db_j / |b_j|^2.
+        """
         graph, factors = self._graph, self._factors
         B, R, count = factors.block, factors.triangle, len(factors.open_columns)
         zero, tau = graph.constant(0.0), graph.constant(1.0)
@@ -194,7 +197,7 @@ class PositionPrograms:
 
 
 def trace_model(model: PositionModel, parameters: int, coordinates: int, data: int = 0) -> TracedModel:
-    """Trace a model for any number of programs; the arguments are those of `PositionPrograms`."""
+    """Return a traced model, from which any number of `PositionPrograms` can be made; the arguments are explained there."""
     examples = jnp.zeros(parameters), jnp.zeros(()), jnp.zeros(coordinates), jnp.zeros(data)
 
     def parts(*numbers: jax.Array) -> list[jax.Array]:

@@ -116,7 +116,10 @@ class RunPrograms:
         return {}
 
     def of(self, *outputs: str) -> LoopProgram:
-        """Return the program that computes some `OUTPUTS`, in this order; scenes have arrays for four linear systems."""
+        """Return the program that computes some `OUTPUTS`, in this order; it is written on the first request.
+
+        Scenes have arrays for four linear systems in one program, which limits the outputs that a program may combine.
+        """
         if outputs not in self._programs:
             self._programs[outputs] = self._write(outputs)
         return self._programs[outputs]
@@ -127,7 +130,7 @@ class RunPrograms:
 
     @classmethod
     def goes_on(cls, outputs: Collection[str]) -> bool:
-        """Return whether a program with these outputs begins with the arrays `BEGINS`."""
+        """Return whether a program with these outputs reads the arrays `BEGINS`, which are then inputs."""
         return not {"a further", "a settled", "pieces"}.isdisjoint(outputs)
 
     def drops(self, outputs: Collection[str]) -> bool:
@@ -136,11 +139,11 @@ class RunPrograms:
 
     @property
     def marks(self) -> slice:
-        """The places of the marks of rows, if there are any, among the numbers: before the two thresholds of pivots."""
+        """The places of the marks of rows among the numbers, if there are any: before the two thresholds of pivots."""
         return slice(self.number_count - 2 - self.row_count, self.number_count - 2)
 
     def with_shared_rows(self, rows: tuple[int, ...]) -> "RunPrograms":
-        """Return programs with the same inputs in which these rows are redundant and share loads, by weights instead of marks."""
+        """Return programs with the same inputs in which `rows` are redundant and share loads; weights take the place of marks."""
         raise NotImplementedError(type(self).__name__)
 
     @property

@@ -1,4 +1,4 @@
-"""The characteristic length, rate and mass of a mechanism, the units of every threshold.
+"""The characteristic length, rate and mass of a mechanism: the units of all thresholds.
 
 analysis.py defines them. One program (scale_program.py) computes them: NumPy runs it if all numbers are concrete, machine code in
 a trace, and JAX on other devices.
@@ -50,7 +50,7 @@ class Scales(NamedTuple):
 
     @property
     def weights(self) -> Float[Array, "m"]:
-        """The weights that make the rows of D comparable, for a single rank tolerance: 1 for rows in metres, L for radians."""
+        """The weights that make the rows of D comparable, for a single rank tolerance: L divided by the scale of each row."""
         if isinstance(self.rows, np.ndarray) or library_for(self) is jnp:
             return self.length / self.rows
         return number(np.asarray(self.length) / np.asarray(self.rows))
@@ -77,7 +77,7 @@ class UnitScales(Scales):
     """The scales of a system whose coordinates are all of order one."""
 
     def coordinates(self, n: int) -> Float[Array, "n"]:
-        """Return the units of coordinates."""
+        """Return the units of coordinates (n,), all of which are one."""
         return number(np.ones(n))
 
     def size(self, q: AnyArray, xp: ArrayLibrary = jnp) -> AnyArray:
@@ -110,7 +110,7 @@ def _unpack(values: Any) -> Scales:
 
 
 def _evaluate(programs: ScenePrograms, numbers: AnyArray, xp: ArrayLibrary) -> AnyArray:
-    """Return the array `scales`."""
+    """Return the array `scales` of a scene with the given numbers."""
     arrays = {name: xp.zeros(size) for name, size in (programs.scratch | programs.scales.sizes).items()}
     with np.errstate(all="ignore"):  # non-finite numbers are checked later
         return _loops(programs, xp)(arrays | {"numbers": numbers})["scales"]
@@ -125,7 +125,7 @@ def _loops(programs: ScenePrograms, xp: ArrayLibrary) -> ArrayLoops:
 
 
 class ScalesPrimitive(Primitive):
-    """The array `scales` for vectors of numbers."""
+    """The operation that computes the array `scales` (scale_program.py) for vectors of numbers (..., numbers)."""
 
     def by_numpy(self, numbers: np.ndarray, programs: ScenePrograms) -> np.ndarray:
         """Return the array `scales` for each vector of `numbers`, by NumPy."""

@@ -29,7 +29,9 @@ class Accelerations(NamedTuple):
 
 
 class SceneArrays(Generic[AnyArray]):
-    """Psi, Psi_dot, Psi_q and loads of a mechanism at a state, or by NumPy at many: t (T,), q and v (n, T), results (..., T).
+    """Psi, Psi_dot, Psi_q and loads of a mechanism, by NumPy or JAX.
+
+    Arguments are t (), q and v (n,) of one state or, for NumPy, t (T,), q and v (n, T) of many; results are then (..., T).
 
     Args:
         programs: The programs of the mechanism's scene.
@@ -82,7 +84,7 @@ class SceneArrays(Generic[AnyArray]):
         return self._run(("energy",), t, q, v)["energy"]
 
     def element_loads(self, t: Time, q: AnyArray, v: AnyArray) -> dict[str, AnyArray]:
-        """Return the entries of the loads of force elements and of their derivatives, as `RestProgram.places` orders them."""
+        """Return the arrays `OF_LOADS`: entries of the loads of force elements and their derivatives, as `RestProgram.places`."""
         return self._run(OF_LOADS, t, q, v)
 
     def curvature(self, t: Time, q: AnyArray, multipliers: AnyArray) -> AnyArray:
@@ -91,15 +93,15 @@ class SceneArrays(Generic[AnyArray]):
         return found[CURVATURE] if CURVATURE in found else self._xp.zeros(0)
 
     def linearization(self, t: Time, q: AnyArray, direction: AnyArray) -> dict[str, AnyArray] | None:
-        """Return the linearization at rest along the tangent part of `direction`, as arrays by name, by elimination.
+        """Return the linearization at rest along the tangent part of `direction`, by elimination.
 
-        `RestProgram.reduction` and the output "balance" explain those of `LINEARIZATION`. None if neither machine code nor
-        floats of Python are possible.
+        The result has the arrays `LINEARIZATION` by name, which `RestProgram.reduction` and the output "balance" explain; None if
+        neither machine code nor Python's floats can run the program.
         """
         return self._run_at_state(LINEARIZATION, t, q, self._xp.zeros_like(q), {"dq": direction}, often=True)
 
     def accelerations(self, t: Time, q: AnyArray, v: AnyArray) -> "Accelerations | None":
-        """Return accelerations at many states by elimination; None until compiling them to machine code pays off."""
+        """Return accelerations at many states by elimination in machine code; None until compiling the program pays off."""
         found: Any = self._run_at_many(self._evaluator(ACCELERATIONS), {"t": np.asarray(t, float).reshape(1, -1), "q": q, "v": v})
         entries: Any = found and self._entries(found)
         return found and Accelerations(found["a"], found["multipliers"], found["distance"][0], entries)
@@ -107,13 +109,16 @@ class SceneArrays(Generic[AnyArray]):
     def newton_step(self, t: Time, q: AnyArray) -> tuple[AnyArray, AnyArray, float] | None:
         """Return q (n,) after a Newton step to Psi = 0 by elimination, Psi (m,) at q, and the distance from dependent rows.
 
-        The step is the smallest in the metric of M. It is by machine code, or on Python's floats; None if neither is possible.
+        The step is the smallest in the metric of M. None if neither machine code nor Python's floats can run the program.
         """
         found = self._run_at_state(("q1", "distance", "psi"), t, q, q, {}, often=True)
         return None if found is None else (found["q1"], found["psi"], float(found["distance"][0]))
 
     def _run(self, outputs: tuple[str, ...], t: Time, q: AnyArray, v: AnyArray, **given: AnyArray) -> dict[str, AnyArray]:
-        """Run the program of some outputs; its loops have independent iterations."""
+        """Return the arrays of some outputs at one state, or at many if q is (n, T).
+
+        The iterations of the program's loops must not depend on each other; `given` are further arrays that it reads.
+        """
         xp = self._xp
         many = q.shape[1:]
         if not many and xp is np and (found := self._run_at_state(outputs, t, q, v, given)) is not None:
@@ -129,16 +134,16 @@ class SceneArrays(Generic[AnyArray]):
         return evaluate(blank | state | given)
 
     def _run_at_many(self, evaluator: "_Evaluator", state: Mapping[str, Any]) -> dict[str, AnyArray] | None:
-        """Run a program at many states by machine code; None until compiling it pays off, or if it is impossible."""
+        """Return the results of a program at many states by machine code; None until that pays off, or if it is impossible."""
         compiled: Any = evaluator.loops.at_many(evaluator.blank, {name: len(x) for name, x in state.items()})
         return None if compiled is None else compiled(np.asarray(self._constants), state)
 
     def _run_at_state(
         self, outputs: tuple[str, ...], t: Any, q: AnyArray, v: AnyArray, given: Mapping[str, AnyArray], often: bool = False
     ) -> dict[str, AnyArray] | None:
-        """Run a program at one state by machine code if compiling it pays off, else on Python's floats; return only its results.
+        """Return the results of a program at one state: by machine code if compiling pays off, else on Python's floats.
 
-        None if neither is possible.
+        None if neither is possible. `often`: the program will run so often that compiling pays off at once.
         """
         evaluate, sizes, results = self._evaluator(outputs)
         state = {"t": t, "q": q, "v": v, **given}
@@ -170,7 +175,7 @@ def _arrays_at(mechanism: Mechanism, t: Time) -> SceneArrays[np.ndarray]:
 
 
 def constants_of(programs: ScenePrograms, numbers: AnyArray, xp: ArrayLibrary) -> AnyArray:
-    """Return the constants of the loops from the numbers of a scene and the gains."""
+    """Return the array `constants` of the programs' loops from the numbers of a scene and the gains, for thresholds of zero."""
     arrays = {"numbers": xp.concatenate([numbers, xp.zeros(2)]), "constants": xp.zeros(len(programs.constants))}
     return _prologue(programs, xp)(arrays)["constants"]
 
@@ -181,7 +186,7 @@ def _prologue(programs: ScenePrograms, xp: ArrayLibrary) -> ArrayLoops:
 
 
 class _Evaluator(NamedTuple):
-    """A program as a function of its arrays."""
+    """A program as a function of its arrays, with the names and lengths of arrays that a call needs."""
 
     loops: ArrayLoops
     blank: dict[str, int]  # the lengths of the arrays that it begins with zeros
@@ -190,7 +195,7 @@ class _Evaluator(NamedTuple):
 
 @cached_by_identity
 def _evaluator(programs: ScenePrograms, xp: ArrayLibrary, *outputs: str) -> _Evaluator:
-    """Return the program of some outputs as a function of its arrays."""
+    """Return the program of some outputs as an `_Evaluator`."""
     p, n, m = programs, programs.coordinate_count, programs.row_count
     at_rest = p.at_rest.sizes if outputs[0] in (*OF_LOADS, CURVATURE) or outputs == LINEARIZATION else {}
     program = p.linearization if outputs == LINEARIZATION else p.at_rest.of(*outputs) if at_rest else p.of(*outputs)

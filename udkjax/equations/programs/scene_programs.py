@@ -76,7 +76,7 @@ class ScenePrograms(RunPrograms):
         self._places: Mechanism = jax.tree.unflatten(tree, places)  # the index of each number of the scene
 
     def with_unit_masses(self, numbers: np.ndarray, length: float) -> np.ndarray:
-        """Return the vector of all numbers with bodies of 1 kg and a radius of gyration (m)."""
+        """Return a copy of the vector of all numbers in which each body has 1 kg and the radius of gyration `length` (m)."""
         numbers = numbers.copy()
         for body in self._places.bodies.values():
             numbers[body.mass], numbers[body.inertia] = 1.0, length**2
@@ -84,20 +84,20 @@ class ScenePrograms(RunPrograms):
 
     @property
     def stored_sizes(self) -> dict[str, int]:
-        """The sizes of all arrays of a state that derivatives may need."""
+        """The sizes, by name, of all arrays that an evaluation at a state fills and that derivatives may need."""
         n = self.coordinate_count
         return {x: size for x, size in self.scratch.items() if x not in RunPrograms.BEGINS} | {"q1": n, "v1": n}
 
     @property
     def piece_count(self) -> int:
-        """The number of piecewise smooth elements."""
+        """The number of values of the output "pieces": piecewise smooth elements, and loads of edges."""
         return self.scratch["pieces"]
 
     @cached_property
     def is_small(self) -> bool:
-        """True if the programs are unrolled because the accelerations take few operations.
+        """True if computing the accelerations takes so few operations that the programs are unrolled.
 
-        Friction does not count, but the shares of redundant rows in its loads do.
+        Operations for friction are not counted, except those that distribute joint loads among redundant rows (load_sharing.py).
         """
         solver = self._solver
         parts = [*solver.acceleration_system, *solver.factorize, *solver.solve(), self._terms.add("a", start="free", solution=0)]
@@ -118,7 +118,7 @@ class ScenePrograms(RunPrograms):
 
     @property
     def number_count(self) -> int:
-        """The number of inputs of `prologue`: all numbers of the scene, gains, marks or weights of rows, and two thresholds."""
+        """The number of inputs of `prologue`: the numbers of the scene, gains, marks or weights of rows, and two thresholds."""
         return self._number_count + self._layout.gains + self._layout.marks + 2
 
     @property
@@ -138,7 +138,7 @@ class ScenePrograms(RunPrograms):
 
     @cached_property
     def with_all_rows(self) -> "ScenePrograms":
-        """The same programs and constants with all rows: redundant rows may be independent in singular configurations."""
+        """Programs with the same constants that eliminate all rows, also redundant ones, under the policy `FALL_BACK`."""
         return ScenePrograms(*self._settings, RankPolicy.FALL_BACK, self._sharing, every_row=True, kernels=self._kernels)
 
     def with_shared_rows(self, rows: tuple[int, ...]) -> "ScenePrograms":
@@ -157,7 +157,7 @@ class ScenePrograms(RunPrograms):
 
     @property
     def psi_q_entries(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """The entries of Psi_q: their rows, columns, indices in the array `psi_q`, and factors."""
+        """The entries of Psi_q: their rows, columns, indices in the array `psi_q`, and the factors of the numbers there."""
         return self._layout.psi_q_entries
 
     @property
@@ -167,7 +167,7 @@ class ScenePrograms(RunPrograms):
 
     @property
     def eliminated_rows(self) -> dict[int, int]:
-        """The index in the linear systems of each retained row of Psi."""
+        """The index in the linear systems of each eliminated row of Psi, by the index of the row."""
         index = {}
         for group in self._layout.eliminated:
             for start, right in zip(group.table[:, ROW].tolist(), group.table[:, RIGHT].tolist(), strict=True):
@@ -176,17 +176,17 @@ class ScenePrograms(RunPrograms):
 
     @cached_property
     def prologue(self) -> LoopProgram:
-        """Compute constants from `numbers`: all numbers of the scene, the gains, the marks of rows, `drop_tol` and `safe_tol`."""
+        """The program that computes `constants` from `numbers`: those of the scene, gains, marks of rows, and two thresholds."""
         return write_prologue(self._layout, self._places, self._number_count)
 
     @cached_property
     def scales(self) -> ScaleProgram:
-        """Compute scales, the characteristic scales at the guess, from `numbers`: those of the scene and the two thresholds."""
+        """The program that computes `scales` at the initial guess, from `numbers`: those of the scene and two thresholds."""
         return write_scales(self._terms, self._places, self._number_count, self.prologue)
 
     @cached_property
     def at_rest(self) -> RestProgram:
-        """The programs for statics."""
+        """The programs of the scene at rest, for statics."""
         return write_rest_program(self._terms)
 
     @cached_property
@@ -197,7 +197,7 @@ class ScenePrograms(RunPrograms):
 
     @cached_property
     def differentiable(self) -> DifferentiablePrograms:
-        """The accelerations and projections as differentiable loops, which reuse the factors of the value."""
+        """The programs of accelerations and projections with derivatives, which reuse the factors of the value."""
         return DifferentiablePrograms(self._solver)
 
 
@@ -214,7 +214,7 @@ def _scene_programs(
 
 
 def programs_of_structure(tree: TreeDef, shapes: LeafShapes, redundant_rows: tuple[int, ...]) -> ScenePrograms:
-    """Return the programs of a structure, as `scene_programs` does."""
+    """Return the programs that `scene_programs` returns for mechanisms of a structure, without the rows `redundant_rows`."""
     return _scene_programs(tree, shapes, redundant_rows, False, RankPolicy.DROP, LoadShares.NONE)
 
 

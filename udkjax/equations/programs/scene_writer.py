@@ -22,7 +22,7 @@ Loops = Callable[[], Iterable[KernelLoop | Reset]]
 
 
 class SceneWriter:
-    """Writes a program: each output in turn, and each intermediate result once, before its first use.
+    """Writer of one program: it writes each output in turn, and each intermediate result once, before its first use.
 
     Linear systems, J M^(-1) J^T x = right with J = Psi_q, share the factors of one elimination. Their numbers begin with those of
     the right-hand sides at the state, which loops compute together with Psi_q.
@@ -58,7 +58,10 @@ class SceneWriter:
         return LoopProgram(parts)
 
     def _terms_of_equations(self, with_friction: Requires) -> dict[str, tuple[Requires, Loops]]:
-        """Return the loops of each result, with the results that they need first."""
+        """Return the terms of the equations by name: the results that each term needs first, and a function that makes its loops.
+
+        `with_friction` are the results from which "free with friction" follows; empty: it is the same as "free".
+        """
         terms = self._terms
         return {
             "sines": ((), lambda: [terms.sincos()]),
@@ -109,7 +112,7 @@ class SceneWriter:
         }
 
     def _next_solve(self) -> int:
-        """Return the number of a further linear system."""
+        """Return the number of a linear system that the program does not use yet."""
         self._solves += 1
         return self._solves - 1
 
@@ -118,7 +121,7 @@ class SceneWriter:
         yield from self._terms.row_terms("b", "terms", self._terms.layout.coordinate_count)
 
     def _root(self) -> ProgramParts:
-        """Compute the diagonal of M^(-1/2)."""
+        """Yield the loop that computes the diagonal of M^(-1/2) in `root`."""
 
         def write(w: KernelWriter):
             for k in range(3):
@@ -127,14 +130,14 @@ class SceneWriter:
         yield self._terms.over_bodies("root", write)
 
     def _add_friction(self) -> ProgramParts:
-        """Add friction proportional to x = -lambda to a_F."""
+        """Yield loops that add the friction that depends on x = -lambda to a_F."""
         assert self._solver.friction is not None
         yield Reset("jt_x0", 0, self._terms.layout.coordinate_count)
         yield from self._solver.friction.add_loads(0)
         yield self._terms.add("free", solution=0, update=ADD)
 
     def _solve_accelerations(self) -> ProgramParts:
-        """Solve the system of the accelerations: x, and jt_x = Psi_q^T x with the friction that depends on x."""
+        """Return the loops that solve the system of the accelerations for x and jt_x, including friction that depends on x."""
         friction = self._solver.friction
         if friction is not None and "a further" in self._outputs:
             return friction.further(0)
@@ -150,7 +153,10 @@ class SceneWriter:
         yield terms.add("a", start="free", solution=solve)
 
     def _correct(self, x: str, solve: int) -> ProgramParts:
-        """Compute x - M^(-1) Psi_q^T y for x = q or v, with y such that the linearized residual vanishes."""
+        """Yield loops that compute x - M^(-1) Psi_q^T y, with y the solution of a linear system, in the array "q1" for x = "q".
+
+        `x` is the name of an array: "q" or "v", whose linearized residual then vanishes, or a change of these, "dq" or "dv".
+        """
         yield from self._solver.solve(solve)
         yield self._terms.add(f"{x}1", start=x, solution=solve, sign=-1)
 
@@ -160,7 +166,7 @@ class SceneWriter:
         yield from self._correct("v", solve)
 
     def _refine(self) -> ProgramParts:
-        """Compute a, q1 and v1 by refined solutions."""
+        """Yield loops that compute a, q1 and v1 by refined solutions of the linear systems 0, 1 and 2."""
         terms, correction = self._terms, self._next_solve()
         yield from self._solver.accelerating_solve(0, refined_by=correction)
         for solve in (1, 2):
@@ -170,13 +176,13 @@ class SceneWriter:
             yield terms.add(f"{x}1", start=x, solution=solve, sign=-1)
 
     def _tangent_part(self, change: str) -> ProgramParts:
-        """Compute the tangent part of a change of the state."""
+        """Yield loops that compute the tangent part of the change "dq" or "dv" of the state."""
         solve = self._next_solve()
         yield from self._terms.rates(change, solve, of_positions=change == "dq")
         yield from self._correct(change, solve)
 
     def _balance(self) -> ProgramParts:
-        """Compute the tangent part of a_F, and the multipliers of the rest of the loads."""
+        """Yield loops that compute a_F as `dv`, its tangent part, and the multipliers of the rest of the loads."""
         solve = self._next_solve()
         yield self._terms.add("dv", start="free")
         yield from self._terms.rates("dv", solve)

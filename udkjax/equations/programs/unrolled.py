@@ -29,14 +29,14 @@ class UnrolledProgram(NamedTuple):
 
 
 class UnrolledDerivative(NamedTuple):
-    """A program, and its derivative along directions or the transpose of the derivative."""
+    """A program, and a program of its derivative: along directions or, in the mode `REVERSE`, the transpose."""
 
     evaluation: UnrolledProgram  # the results, and "stored": numbers that the derivative needs
     derivative: UnrolledProgram
 
 
 class Unrolled:
-    """Programs of a scene, by their outputs, and the derivatives of some of them.
+    """Unrolled programs of a scene, by their outputs, and the derivatives of some of them.
 
     Args:
         programs: The programs as loops.
@@ -97,11 +97,11 @@ class Unrolled:
         self._inputs |= {s: (x, k) for x, scalars in (state | begins).items() for k, s in scalars.items()}
 
     def program(self, *outputs: str) -> UnrolledProgram:
-        """Return the program with some outputs."""
+        """Return the program of some outputs, one of those in `asked`."""
         return self._program(self._results[outputs], {})
 
     def derivative(self, *of: str) -> UnrolledDerivative:
-        """Return a differentiable program with its derivative."""
+        """Return the differentiable program of the outputs `of`, one of those in `differentiated`, with its derivative."""
         results, outputs = self._derivatives[of]
         before_seeds = frontier(self.graph, list(outputs.values()), lambda node: not node.depends & {"tangent", "cotangent"})
         others = {s for scalars in self._begins.values() for s in scalars.values()}  # of another state by the time of `reverse`
@@ -112,11 +112,14 @@ class Unrolled:
 
     @property
     def slopes(self) -> UnrolledDerivative:
-        """The accelerations with their derivative by the state alone."""
+        """The program of the accelerations, with their derivative by q and v but not by numbers."""
         return self.derivative(*SLOPES)
 
     def evaluations(self, named: Mapping[str, OutputNames]) -> UnrolledProgram:
-        """Return the program of the numbers that derivatives need at one state, in arrays "stored" plus the name of a program."""
+        """Return the program of all numbers that the derivatives of some programs need at one state.
+
+        `named` are the outputs of these programs by a name of each; the numbers are in arrays such as "stored NAME".
+        """
         stored: dict[ArrayPlace, Scalar] = {}
         for name, outputs in named.items():
             evaluation = self.derivative(*outputs).evaluation
@@ -167,7 +170,7 @@ class Unrolled:
     def _differentiate(
         self, differentiable: DifferentiableProgram, n: int, mode: str, moving: Sequence[int]
     ) -> tuple[dict[ArrayPlace, Scalar], dict[ArrayPlace, Scalar]]:
-        """Return the results and their tangents, or the cotangents of the inputs."""
+        """Return the results, and their tangents or, in the mode `REVERSE`, the cotangents of the inputs, by their places."""
         arrays = self._unroll(differentiable.program, self._begins)
         results = {x: range(n) for x in ("a", "q1", "v1") if x in arrays}
         variables = {"constants": moving, "q": range(n), "v": range(n)}
@@ -191,7 +194,7 @@ def _entries(arrays: Arrays, names: Sequence[str]) -> dict[ArrayPlace, Scalar]:
 
 
 def _depending(graph: Graph, scalars: Sequence[Scalar]) -> set[int]:
-    """Return the nodes that depend on any of the scalars."""
+    """Return the indices of the nodes that depend on any of the scalars, including the scalars themselves."""
     dependent = {s.index for s in scalars}
     for index, node in enumerate(graph.nodes):
         if any(a.index in dependent for a in node.arguments):

@@ -54,7 +54,7 @@ class Analysis(PrintsTable):
         coordinates: number of coordinates.
         row_names: for each row of Psi, its constraint and its index within that constraint.
         redundant_rows: indices of the rows that depend on others; None: unknown.
-        balance: factors of the units of rows and coordinates in which ranks are counted, powers of ten; None: all are one.
+        balance: factors, powers of ten, of the units of rows and coordinates in which ranks are counted; None: all are one.
         only_switched: whether all dependent rows belong to constraints that are switched off.
     """
 
@@ -131,20 +131,23 @@ class Analysis(PrintsTable):
 
     @staticmethod
     def require_masses(model: RunModel, asked_by: str) -> None:
-        """Require masses of all links of a model, unless drivers determine its motion; as its own `require_masses`."""
+        """Raise `ArgumentError` if links of a model lack masses, unless drivers determine its motion.
+
+        `asked_by` are the results that depend on masses, as in `RunModel.require_masses`.
+        """
         found = analysis_of(model) if model.massless else None
         if found is not None and (found.rank is None or found.coordinates > found.rank):
             model.require_masses(asked_by, "let motors determine the motion")
 
     def with_numbers_of(self, mechanism: Mechanism) -> "Analysis":
-        """Return the analysis with the scales of the mechanism with other, traced numbers."""
+        """Return this analysis with the scales of `mechanism`, the same mechanism with other, traced numbers."""
         own = traced_scales(mechanism)
         if self.balance is not None:
             own = own._replace(rank_tol=jnp.minimum(own.rank_tol, self.scales.rank_tol))
         return replace(self, scales=own)
 
     def with_rows_of(self, mechanism: Mechanism, only_switched: bool = False) -> "Analysis":
-        """Return the analysis of the mechanism with more constraints, without knowledge of their redundant rows.
+        """Return the analysis of the same mechanism with more constraints; redundant rows and balance are unknown in it.
 
         Its lengths, times and masses stay those of the original mechanism.
 
@@ -193,7 +196,7 @@ def analyse(mechanism: Mechanism) -> Analysis:
 
 
 def analysis_of(model: RunModel) -> Analysis | None:
-    """Return the analysis of a mechanism; a model without bodies has none: its coordinates and rows are of order one."""
+    """Return the analysis of a mechanism; None for a model without bodies, whose coordinates and rows are of order one."""
     return analyse(model) if isinstance(model, Mechanism) else None
 
 
@@ -248,7 +251,7 @@ def _analyse(mechanism: Mechanism, kind: Hashable) -> Analysis:
 
 
 def _with_rank_tol(mechanism: Mechanism, scales: Scales, found: FoundRows) -> Scales:
-    """Return the scales with a rank tolerance of D below the singular values that gears make small in any position."""
+    """Return the scales; where gears make singular values of D small in any position, with a rank tolerance below these."""
     if found.position is None or found.redundant is None:
         return scales
     rows = DenseRows(mechanism, scales)
@@ -271,7 +274,10 @@ class Holding(NamedTuple):
 
 @cached_by_identity  # the result must not contain the mechanism, or the cache would keep it in memory
 def hold_pins(mechanism: Model) -> Holding | None:
-    """Hold the pins that constraints hold only to second order (stationary_rows.py), if concrete numbers show any; else None."""
+    """Return the mechanism with the angles of pins held that constraints hold only to second order (stationary_rows.py).
+
+    None if there are no such pins, if no concrete numbers are known by which to find them, or if the model has no bodies.
+    """
     if not isinstance(mechanism, Mechanism):
         return None
     source = mechanism if mechanism.is_concrete else mechanism.origin and mechanism.origin.mechanism
@@ -288,7 +294,10 @@ def _held_pins(mechanism: Mechanism) -> tuple[HeldPin, ...]:
 
 
 def _rows_of_concrete_geometry(mechanism: Mechanism) -> tuple[tuple[int, ...] | None, BalancedUnits | None]:
-    """Return redundant rows and balance of a mechanism with traced masses or loads; None if its geometry is traced as well."""
+    """Return the redundant rows and the balance of a mechanism with traced masses or loads.
+
+    Both are None, that is, unknown, if the geometry is traced as well.
+    """
     with jax.ensure_compile_time_eval():
         if is_traced(_geometry(mechanism)):
             return None, None

@@ -48,7 +48,7 @@ class BalancedUnits(NamedTuple):
 
 @cached_by_identity
 def balance_of(mechanism: Mechanism) -> BalancedUnits | None:
-    """Return the balance of Psi_q of a mechanism with concrete numbers; None if the units of `Scales` are as good."""
+    """Return the balance of Psi_q of a mechanism with concrete numbers; None if the units of `Scales` are balanced enough."""
     sizes = _Coefficients(mechanism)
     if not sizes.rows.size:
         return None
@@ -61,7 +61,7 @@ def balance_of(mechanism: Mechanism) -> BalancedUnits | None:
 
 
 class _Coefficients:
-    """The sizes of coefficients of rows and groups, which are the two displacements of a body, or its angle."""
+    """The sizes of the coefficients of Psi_q, by rows and groups of coordinates: a body's two displacements, and its angle."""
 
     def __init__(self, mechanism: Mechanism):
         programs = scene_programs(mechanism)
@@ -92,7 +92,7 @@ class _Coefficients:
 
 
 def _solve(sizes: _Coefficients) -> np.ndarray:
-    """Return r of the rows and c of the groups, zero for those that are not free, by the normal equations."""
+    """Return r of the rows, followed by c of the groups, which is zero if a group is not free, by the normal equations."""
     m, logs, w = sizes.row_count, np.log(sizes.size), sizes.weight
     free = sizes.is_free[sizes.groups]
     columns = m + sizes.groups

@@ -91,7 +91,7 @@ class DenseTerms(RowTerms):
         return DenseTerms(mechanism)
 
     def eliminated(self, redundant_rows: tuple[int, ...], length: float | None) -> Eliminated | None:
-        """Return programs of elimination, as `Eliminated` explains; None if numbers are sampled over time."""
+        """Return the mechanism's `Eliminated`, which explains the arguments; None if numbers are sampled over time."""
         return None if self._is_sampled else Eliminated(self._kind, self._arrays_at(0.0).numbers, redundant_rows, length)
 
     def slopes(self, t: Time, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -107,7 +107,7 @@ class DenseTerms(RowTerms):
         return b + self.slopes(t, q)[0] @ free
 
     def loads_at_rest(self, t: Time, q: np.ndarray) -> RestingLoads:
-        """Return the loads at rest in a position, and their derivatives; those at the last position are cached."""
+        """Return the loads at rest in a position, and their derivatives; the result at the last position is cached."""
         key, latest = _key(t, q), self._latest_loads
         if latest[0] != key:
             self._latest_loads = latest = key, self._find_loads(t, q)
@@ -136,7 +136,7 @@ class DenseTerms(RowTerms):
         return np.bincount(self._places(name), entries, self.size**2).reshape(self.size, self.size)
 
     def _places(self, name: str) -> np.ndarray:
-        """Return the places of a matrix's entries among its entries in the order of rows."""
+        """Return the indices, in the flattened matrix, of the entries that elements write to the matrix `name`."""
         found = self._flat.get(name)
         if found is None:
             place = self._programs.at_rest.places[name]
@@ -145,7 +145,7 @@ class DenseTerms(RowTerms):
 
 
 class DenseRows(DenseTerms):
-    """The rows of a mechanism with concrete numbers, by NumPy on the scene's programs. The metric is M^(-1/2)."""
+    """The rows of Psi and D of a mechanism with concrete numbers, by NumPy on the scene's programs. The metric is M^(-1/2)."""
 
     def __init__(self, mechanism: Mechanism, scales: Scales):
         super().__init__(mechanism)
@@ -154,7 +154,7 @@ class DenseRows(DenseTerms):
         self.weights = self.scales.weights
 
     def violation(self, t: Time, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return Psi and Psi_dot."""
+        """Return Psi (m,) and Psi_dot (m,)."""
         return self.geometry(t, q, v)[:2]
 
     def residual(self, t: Time, q: np.ndarray) -> np.ndarray:
@@ -169,7 +169,7 @@ class DenseRows(DenseTerms):
         return self.slopes(t, q)[0]
 
     def plus(self, t: Time, q: np.ndarray) -> FactoredPseudoinverse | TruncatedPseudoinverse:
-        """Return D^+ of weighted rows in the metric."""
+        """Return D^+ of D = diag(weights) Psi_q diag(metric)."""
         return dense_pseudoinverse(self.weights[:, None] * self.jacobian(t, q) * self.metric, self._tol)
 
     def correction(self, t: Time, q: np.ndarray) -> np.ndarray:
@@ -236,7 +236,10 @@ class KinematicRows(DenseRows, PositionRows[DensePosition]):
         self._eliminated: Eliminated | None = None
 
     def leave_out(self, redundant_rows: tuple[int, ...]) -> None:
-        """Eliminate coordinates in corrections where all other rows are clearly independent; the steps are the same."""
+        """Make `correction` leave out redundant rows and use elimination, where all other rows are clearly independent.
+
+        The steps are the same up to rounding. Where rows are balanced, corrections stay as they are.
+        """
         if self.balance is None:
             self._eliminated = self.eliminated(redundant_rows, float(self.scales.arm))
 

@@ -81,7 +81,7 @@ def singular_values(mechanism: Mechanism, t: NumberLike, q: BodyArray, analysis:
 def left_null_space(
     mechanism: Mechanism, t: NumberLike, q: BodyArray, analysis: Analysis | None = None, rank_tol: NumberLike = STATIC_RANK_TOL
 ) -> LeftNullSpace:
-    """Return N, J^T N = 0, with orthonormal columns; singular values up to `rank_tol` times the largest count as zero."""
+    """Return N with J^T N = 0, and the rank of J; singular values up to `rank_tol` times the largest count as zero."""
     J = scaled_jacobian(mechanism, t, q, analysis)
     rows, columns = J.shape
     if not J.size:
@@ -94,7 +94,7 @@ def left_null_space(
 def uniqueness(
     mechanism: Mechanism, t: NumberLike, q: BodyArray, analysis: Analysis | None = None, rank_tol: NumberLike = STATIC_RANK_TOL
 ) -> Uniqueness:
-    """Determine for each row of Psi whether its multiplier is unique, that is, whether its row of N is zero.
+    """Return marks of the rows of Psi whose multipliers are unique: their rows of N are zero.
 
     Args:
         mechanism: its numbers may be traced.

@@ -23,7 +23,10 @@ from udkjax.equations.programs.scales import Scales
 
 
 class StepAside(NamedTuple):
-    """A step from an initial position to one that is not singular, where rows that depend on others do so everywhere."""
+    """Constants for a step from an initial position, which may be singular, to a position that is not.
+
+    There a row that depends on others does so in all positions.
+    """
 
     # Length of the step in the scene's units. A row that depends on others only at the start of the step has a relative pivot of
     # about its square at the end: much more than the threshold of dependence. The step is also short enough for Newton's method.
@@ -34,7 +37,7 @@ class StepAside(NamedTuple):
 
 
 class DigitsRule(NamedTuple):
-    """The distance from dependent rows beyond which ten digits of the second derivatives q'' of positions are correct.
+    """Thresholds of the distance from dependent rows, for ten correct digits of the second derivatives q'' of positions.
 
     With the distance sigma of the rows from dependence, relative to its largest value, and its rate c along the arc, rounding
     errors of q'' are 1e-16 (1 / sigma^2 + c^2 / sigma^3). Near a meeting of branches c is about one. Where links are short beside
@@ -46,7 +49,7 @@ class DigitsRule(NamedTuple):
     arc: float = 1e-4  # over which c is a difference, in units of the scene's scales
 
     def hold(self, sigma: Any, rate: Any) -> Any:
-        """Return True if ten digits of q'' are correct at a distance `sigma` with the rate c; arrays or values of a module."""
+        """Return True where ten digits of q'' are correct at distances `sigma` with rates c: arrays or values in machine code."""
         return (sigma > self.least) & (rate * rate * self.clear**3 < sigma * sigma * sigma)
 
 
@@ -96,12 +99,12 @@ class Rows(Protocol[AnyArray]):
         ...
 
     def correction(self, t: Time, q: AnyArray) -> AnyArray:
-        """Return -W D^+ Psi."""
+        """Return the Gauss-Newton step -W D^+ Psi (n,)."""
         ...
 
 
 class ConcreteRows(Rows[np.ndarray], Protocol):
-    """The rows of Psi of concrete numbers."""
+    """The rows of Psi of a mechanism with concrete numbers."""
 
     def step_size(self, step: np.ndarray) -> float:
         """Return the largest component of a step (n,), in rad or characteristic lengths."""
@@ -114,7 +117,7 @@ def rounding(scales: Scales, q: AnyArray, xp: ArrayLibrary) -> AnyArray:
 
 
 def is_closed(scales: Scales, q: AnyArray, v: AnyArray, psi: AnyArray, psi_dot: AnyArray, xp: ArrayLibrary) -> AnyArray:
-    """Return whether Psi and Psi_dot are within `CLOSURE.tol` in units of the scene's scales, or at rounding level."""
+    """Return True if Psi and Psi_dot are at most `CLOSURE.tol` in units of the scene's scales, or rounding errors."""
     open_by = xp.maximum(CLOSURE.tol, rounding(scales, q, xp))
     rate = xp.maximum(scales.rate, scales.size(v, xp))
     return (scales.violation(psi, xp) <= open_by) & (scales.violation(psi_dot, xp) <= open_by * rate)
@@ -133,9 +136,9 @@ def _fixed(x: Any) -> Any:
 
 
 def damped_step(rows: Rows[jax.Array], t: Time, q: jax.Array, goes_on: bool = False) -> tuple[jax.Array, jax.Array]:
-    """Return q after one step, halved until the residual falls, and whether it fell.
+    """Return q after one Gauss-Newton step, halved until the residual falls, and True if it fell.
 
-    At rounding level, or if no step lowers the residual, q stays, or, if it `goes_on`, takes the step all the same.
+    If the residual is a rounding error, or no step lowers it, q is returned unchanged; with `goes_on`, q after the whole step.
     """
     fixed, current = jax.tree.map(_fixed, (rows, q))
     size = jnp.linalg.norm(fixed.residual(t, current))
@@ -157,7 +160,7 @@ def damped_step(rows: Rows[jax.Array], t: Time, q: jax.Array, goes_on: bool = Fa
 
 
 def close_position(rows: Rows[Any], t: Time, q: AnyArray, xp: ArrayLibrary = jnp) -> AnyArray:
-    """Take steps until the residual is at rounding level, or no step lowers it."""
+    """Return q after Gauss-Newton steps, until the residual is a rounding error, no step lowers it, or there are too many."""
     if xp is np:
         *_, (closed, _) = _positions_by_numpy(cast(ConcreteRows, rows), t, q)
         return closed
@@ -174,7 +177,7 @@ def close_position(rows: Rows[Any], t: Time, q: AnyArray, xp: ArrayLibrary = jnp
 
 
 def _positions_by_numpy(rows: ConcreteRows, t: Time, q: Any) -> Iterator[tuple[Any, float]]:
-    """Take the steps of `close_position` by NumPy; return the first position and that after each step, with their residuals."""
+    """Yield the first position, and the position after each step of `close_position` by NumPy, with the norms of residuals."""
     size = _norm(rows.residual(t, q))
     yield q, size
     for _ in range(CLOSURE.steps):
@@ -201,10 +204,10 @@ def _norm(x: np.ndarray) -> float:
 
 
 def try_to_close(rows: ConcreteRows, t: Time, q: np.ndarray) -> np.ndarray:
-    """Close a position that may not exist, by NumPy: give up when the remaining steps would not suffice at the current rate.
+    """Return q after steps of `close_position` by NumPy, which stop early if there seems to be no closed position.
 
-    A successful closure converges fastest in its last steps. If the position does not exist, the residual keeps falling, but ever
-    more slowly.
+    They stop when the remaining steps would not suffice at the current rate. A successful closure converges fastest in its last
+    steps. If the position does not exist, the residual keeps falling, but ever more slowly.
     """
     sizes = list[float]()
     for position, size in _positions_by_numpy(rows, t, q):
@@ -218,5 +221,8 @@ def try_to_close(rows: ConcreteRows, t: Time, q: np.ndarray) -> np.ndarray:
 
 
 def driver_time_step(scales: Scales) -> float:
-    """Return the time (s) between positions of the random motion, in which drivers move about as far as the other coordinates."""
+    """Return the time (s) between positions of the random motion of `PositionRows.sample`; zero if nothing moves by itself.
+
+    In this time drivers move about as far as the other coordinates.
+    """
     return CLOSURE.longest_step / float(scales.rate) if scales.rate > 0.0 else 0.0

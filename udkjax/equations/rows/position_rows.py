@@ -65,11 +65,14 @@ class PositionRows(ABC, Generic[Position]):
 
     @abstractmethod
     def at(self, t: Time, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, Any]:
-        """Return Psi, the lengths of the rows of D, and D with unit rows, which does not change solutions of consistent rows."""
+        """Return Psi, the lengths of the rows of D, and D with unit rows.
+
+        Scaling rows does not change the solutions of consistent equations.
+        """
 
     @abstractmethod
     def dense(self, matrix: Any) -> np.ndarray:
-        """Return D, or a part or a null space of it, as a NumPy array."""
+        """Return D, a part of D or a null space of D, which may be sparse, as a NumPy array."""
 
     @abstractmethod
     def residual(self, t: Time, q: np.ndarray) -> np.ndarray:
@@ -81,15 +84,18 @@ class PositionRows(ABC, Generic[Position]):
 
     @abstractmethod
     def correction(self, t: Time, q: np.ndarray) -> np.ndarray:
-        """Return -W D^+ Psi."""
+        """Return the Gauss-Newton step -W D^+ Psi (n,)."""
 
     @abstractmethod
     def close(self, t: Time, q: np.ndarray, give_up: bool = False) -> Position | None:
-        """Return a closed position near q, or None; `give_up` early if it seems not to exist."""
+        """Return a closed position near q; None if none is found. `give_up`: stop early if there seems to be none."""
 
     @abstractmethod
     def split_rows(self, positions: list[Position]) -> Sequence[tuple[np.ndarray, Sequence[Any]]]:
-        """Return sets of dependent rows, each with its `smallest` singular value and its `null_space` at each position."""
+        """Return sets of rows that depend on each other, as indices, each with a record of the set at each position.
+
+        A record has the `smallest` nonzero singular value of the set, relative to the largest, and its left `null_space`.
+        """
 
     @np.errstate(all="ignore")
     def sample(self, q: np.ndarray) -> list[Position]:
@@ -154,7 +160,7 @@ class PositionRows(ABC, Generic[Position]):
 
     @staticmethod
     def dispensable(null_spaces: list[np.ndarray]) -> tuple[int, ...]:
-        """Choose rows S, as many as each null space has columns, such that N[S] is as far from singular as possible for every N.
+        """Return rows S, as many as each null space has columns, such that N[S] is as far from singular as possible for every N.
 
         Greedy: take the row whose smallest length over all N is largest; then project the direction of that row out of each N.
         Among equal rows the last is chosen, so that a copy is left out and its original stays.

@@ -14,7 +14,7 @@ from udkjax.scene.mechanism import Mechanism
 
 
 class FoundRows(NamedTuple):
-    """The dependent rows of Psi."""
+    """The redundant rows of Psi, pins that rows hold to second order only, and balanced units: the result of `examine_rows`."""
 
     redundant: tuple[int, ...] | None  # the rows to leave out; None if the guess cannot be closed or moved
     held: tuple[HeldPin, ...]  # the pins that rows hold to second order only
@@ -24,7 +24,10 @@ class FoundRows(NamedTuple):
 
 @np.errstate(all="ignore")  # non-finite coordinates are not closed
 def examine_rows(mechanism: Mechanism, large: bool | None = None) -> FoundRows:
-    """Find redundant rows, and pins held to second order, by `kinematic_rows`. All numbers are concrete."""
+    """Find the redundant rows of a mechanism with concrete numbers, and the pins that rows hold to second order only.
+
+    `large` decides between dense and sparse matrices: see `kinematic_rows`.
+    """
     rows = kinematic_rows(mechanism, large)
     if not rows.count:
         return FoundRows((), (), None)
@@ -42,7 +45,7 @@ def redundant_rows(mechanism: Mechanism, large: bool | None = None) -> tuple[int
 
 
 def dependent_constraints(mechanism: Mechanism, q: np.ndarray) -> tuple[str, ...]:
-    """Return the names of the constraints whose rows are dependent at a closed position, by the left null space of D."""
+    """Return the names of the constraints with dependent rows at a closed position near q; none if it cannot be closed."""
     rows = kinematic_rows(mechanism)
     position = rows.close(0.0, np.asarray(q, float).ravel()) if rows.count else None
     if position is None:
@@ -82,7 +85,10 @@ def holders_of_driver(mechanism: Mechanism, name: str) -> set[str] | None:
 
 
 def kinematic_rows(mechanism: Mechanism, large: bool | None = None) -> PositionRows:
-    """Return Psi and D of a mechanism with concrete numbers: `KinematicRows`, or for large scenes `SparseRows`."""
+    """Return the rows of a mechanism with concrete numbers: `SparseRows` if the scene is large, else `KinematicRows`.
+
+    `large` is None if the size of the scene decides.
+    """
     if not (large or (large is None and not scene_programs(mechanism).is_small)):
         return KinematicRows(mechanism)
     from udkjax.equations.rows.sparse_rows import SparseRows  # imports SciPy, which small scenes do not need

@@ -36,7 +36,7 @@ NULL_SPACE_BATCH = 64  # number of columns of a null space solved for at a time,
 
 
 class SparsePosition(NamedTuple):
-    """A closed position with the pivots of its rows."""
+    """A closed position with D, whose rows have unit length, and the pivots of the rows in the elimination of D D^T."""
 
     t: Time
     q: np.ndarray
@@ -98,7 +98,7 @@ def _stack_columns(blocks: list[SparseMatrix], rows: int) -> SparseMatrix:
 class SparseRows(RowTerms, PositionRows[SparsePosition]):
     """Psi and sparse D of a mechanism with concrete numbers, in the metric M^(-1/2), or (A, A, 1) to find redundant rows.
 
-    It also has what assembly needs of `DenseRows`.
+    Like `DenseRows`, it can assemble a mechanism (`assemble`).
     """
 
     def __init__(self, mechanism: Mechanism, kinematic: bool = False):
@@ -180,7 +180,7 @@ class SparseRows(RowTerms, PositionRows[SparsePosition]):
 
 
 def find_pivots(gram: SparseMatrix, order: list[int]) -> np.ndarray:
-    """Return the pivots of D D^T in the order of elimination, for unit rows; dependent rows are skipped."""
+    """Return the pivot of each row, by elimination of D D^T in a given order, for unit rows; dependent rows are skipped."""
     position = np.empty(len(order), int)
     position[order] = np.arange(len(order))
     column: list[dict[int, float]] = [{} for _ in order]
@@ -211,7 +211,7 @@ class RowSubset(NamedTuple):
 
 
 def split_dependent_rows(positions: list[SparsePosition]) -> list[tuple[np.ndarray, list[RowSubset]]]:
-    """Split the rows into sets that depend on each other, and compute the null space of each set."""
+    """Return the sets of rows that depend on each other, as indices, each with its null space at each position."""
     null_vectors = _stack_columns([coo_array(p.null_space) for p in positions], len(positions[0].pivots))
     rows, columns = null_vectors.shape
     links = coo_array(

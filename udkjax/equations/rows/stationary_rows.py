@@ -40,7 +40,7 @@ class HeldPin(NamedTuple):
     direction: float  # of the force in the pin that has no effect to first order, in ground axes (rad)
 
     def prismatic(self, mechanism: Mechanism, q: np.ndarray) -> Prismatic:
-        """Return the joint that replaces the pin at a position q (n,): it leaves out the row that has no effect."""
+        """Return the prismatic joint that replaces the pin at a position q (n,): it lacks the row that has no effect."""
         base = self.bodies[0]
         angle = 0.0 if base == GROUND else float(q[3 * mechanism.body_names.index(base) + 2])
         return Prismatic(self.bodies, mechanism.joints[self.name].points, self.direction - angle, self.angle)
@@ -51,8 +51,8 @@ def held_pins(mechanism: Mechanism, rows: KinematicRows, q: np.ndarray, redundan
 
     Args:
         mechanism: the scene, with concrete numbers.
-        rows: its rows.
-        q: a position.
+        rows: the rows of the mechanism.
+        q: the coordinates (n,) of a position, which need not be closed.
         redundant: the number of rows that are redundant in the usual sense.
     """
     position = _closed(rows, q)
@@ -70,7 +70,7 @@ def held_pins(mechanism: Mechanism, rows: KinematicRows, q: np.ndarray, redundan
 
 
 def with_held_pins(mechanism: Mechanism, pins: Sequence[HeldPin]) -> Mechanism:
-    """Return the mechanism with the angles of held pins."""
+    """Return the mechanism with a further joint for each pin, an `Angle` that holds the angle between its bodies."""
     if not pins:
         return mechanism
     angles = {f"{pin.name}.angle": Angle(pin.bodies, pin.angle) for pin in pins}
@@ -80,7 +80,9 @@ def with_held_pins(mechanism: Mechanism, pins: Sequence[HeldPin]) -> Mechanism:
 
 
 def _closed(rows: KinematicRows, q: np.ndarray) -> DensePosition | None:
-    """Return a closed position where small singular values are zero: Newton's method for Psi converges slowly to such a position.
+    """Return a closed position near q where small singular values of D are zero; None if there is no closed position near q.
+
+    Newton's method for Psi converges slowly to such a position.
 
     A gradient u . D that vanishes on the motion grows in proportion to the distance from it, along its right vector v.
     """
@@ -102,7 +104,10 @@ def _closed(rows: KinematicRows, q: np.ndarray) -> DensePosition | None:
 
 
 def _rank(position: DensePosition) -> int:
-    """Return the rank; near the motion, gradients that vanish on it are as small as the errors of the position."""
+    """Return the rank of D with the threshold `CLEAR_TOL`.
+
+    Near the motion, gradients that vanish on it are as large as the errors of the position.
+    """
     return int(np.sum(position.sigma > CLEAR_TOL * position.sigma[0]))
 
 
@@ -148,7 +153,7 @@ def _second_derivatives(rows: KinematicRows, t: Any, q: np.ndarray, tangents: np
 
 
 def _motion(mechanism: Mechanism, start: DensePosition) -> Iterator[DensePosition]:
-    """Iterate over positions of a motion from a position; none if the mechanism cannot move."""
+    """Iterate over closed positions of a random motion, and of the drivers, from a position; none if this cannot be closed."""
     rows, random = KinematicRows(mechanism), np.random.default_rng(0)
     last, heading = rows.close(start.t, start.q), random.standard_normal(len(start.q))
     for k in range(POSITIONS):
@@ -164,7 +169,7 @@ def _motion(mechanism: Mechanism, start: DensePosition) -> Iterator[DensePositio
 
 
 def _are_held(mechanism: Mechanism, pins: list[HeldPin], at: DensePosition) -> bool:
-    """Return whether all pins are held at a position, one after another."""
+    """Return whether all pins are held at a position, each with the pins before it held by their angles."""
     for k, pin in enumerate(pins):
         holding = with_held_pins(mechanism, pins[:k])
         if pin.name not in {x.name for x in _held(holding, KinematicRows(holding), at)}:

@@ -28,7 +28,7 @@ CLEARLY = 0.1  # rank tolerance over the rank tolerance at which rows would coun
 def efforts_by_numpy(
     mechanism: Mechanism, slopes: Slopes, analysis: Analysis, weights: ArrayLike, ts: ArrayLike, motion: Sequence[ArrayLike]
 ) -> EffortArrays | None:
-    """Return efforts along coordinates, the rates of these, and the unbalanced part of the loads; None if numbers are traced.
+    """Find the efforts along some coordinates that a prescribed motion requires, by NumPy.
 
     Args:
         mechanism: the mechanism without its drivers.
@@ -39,7 +39,8 @@ def efforts_by_numpy(
         motion: q, v and a, each (T, bodies, 3).
 
     Returns:
-        Efforts (k, T), rates (k, T) and unbalanced parts (T,).
+        Efforts (k, T), rates (k, T) of their coordinates, and the parts (T,) of the loads that no efforts balance, relative to
+        the largest load; None if numbers are traced.
     """
     if not by_numpy(mechanism, (analysis.scales, weights, ts, motion)):
         return None
@@ -113,11 +114,11 @@ def _efforts_along(
     missing: np.ndarray,
     u: np.ndarray,
 ) -> _Found:
-    """Return efforts (k, T), unbalanced loads (T,), and a mask of the times for which the motion determines them.
+    """Return efforts (k, T), unbalanced loads (T,), and a mask of the times for which the motion determines both.
 
     With one degree of freedom the direction u of the motion spans the null space of J, if it satisfies J u = 0: the drivers have
-    the power that the loads lack. They must be able to move the mechanism. `entries` (entries, T) are those of J, and `largest`
-    (T,) the largest of them.
+    the power that the loads lack. The drivers must be able to move the mechanism. `entries` (entries, T) are those of J, and
+    `largest` (T,) are the largest of these in magnitude.
     """
     k, _, T = pull.shape
     speed = np.sqrt((u * u).sum(0))
@@ -146,7 +147,7 @@ def _efforts_of_rows(
 
 
 def _regular_efforts(scale: _Units, J: np.ndarray, pull: np.ndarray, missing: np.ndarray) -> _Found:
-    """Return efforts (T, k), unbalanced loads (T,), and a mask of the times for which they are right.
+    """Return efforts (T, k), unbalanced loads (T,), and a mask of the times for which both are right.
 
     Where the independent rows of joints and the drivers' rows are as many as the coordinates, and clearly independent,
     A^T (mu, f) = M a - F has one solution. The rank of J is then that of the independent rows: with A (P N) = 1, the columns of N
@@ -180,7 +181,7 @@ def _length(A: np.ndarray) -> np.ndarray:
 
 
 def _any_efforts(analysis: Analysis, J: np.ndarray, pull: np.ndarray, missing: np.ndarray, u: np.ndarray) -> _Found:
-    """Return efforts (T, k), unbalanced loads (T,), and whether they are determined, for any number of rows and of any rank."""
+    """Return efforts (T, k), unbalanced loads (T,), and a mask of determined efforts, for any number of rows and any rank."""
     held, rank = _row_space(J)
     determined, known_rank = np.ones(len(J), bool), analysis.rank
     if known_rank is not None:  # otherwise the number of degrees of freedom is unknown
@@ -189,7 +190,7 @@ def _any_efforts(analysis: Analysis, J: np.ndarray, pull: np.ndarray, missing: n
         determined = ~deficient | ((analysis.degrees_of_freedom == 1) & (speed > 0))
 
     def free(x: np.ndarray) -> np.ndarray:
-        """Return the part of columns (T, n, k) that the joints do not hold: in deficient positions, along the motion."""
+        """Return the part of columns (T, n, k) that joints do not hold; if the rank is deficient, the part along the motion."""
         result = x - held.transpose(0, 2, 1) @ (held @ x)
         if known_rank is not None and deficient.any():
             along = np.where(speed > 0, u.T / speed, 0.0).T[deficient, :, None]
@@ -204,7 +205,7 @@ def _any_efforts(analysis: Analysis, J: np.ndarray, pull: np.ndarray, missing: n
 
 
 def _row_space(J: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return orthonormal rows (T, k, n) that span those of matrices (T, m, n), zero beyond the rank, and the rank (T,)."""
+    """Return orthonormal bases (T, k, n) of the row spaces of matrices (T, m, n), zero beyond the rank, and the ranks (T,)."""
     if not J.shape[1]:
         return np.zeros((len(J), 0, J.shape[2])), np.zeros(len(J), int)
     vt, _, inverse = _decompose(J)
@@ -212,7 +213,7 @@ def _row_space(J: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _decompose(A: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return V^T, U and 1/sigma of matrices (T, m, n), zero where sigma is zero up to rounding."""
+    """Return V^T, U and 1 / sigma of matrices (T, m, n); 1 / sigma is zero where sigma is negligible (`RANK_TOL`)."""
     u, sigma, vt = np.linalg.svd(A, full_matrices=False)
     counts = sigma > RANK_TOL * sigma[:, :1]
     return vt, u, np.where(counts, 1 / np.where(counts, sigma, 1.0), 0.0)

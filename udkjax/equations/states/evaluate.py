@@ -1,8 +1,8 @@
 """Quantities of the equations of motion at a state: the public functions of `udkjax.equations`.
 
-Those of concrete numbers are computed by NumPy on the scene's programs (state_arrays.py). With traced numbers each is compiled as
-one program: without compilation, JAX would dispatch dozens of operations one by one. Inside the package, larger programs call the
-uncompiled functions.
+If all numbers are concrete, NumPy computes a quantity on the scene's programs (state_arrays.py). With traced numbers each
+quantity is compiled as one program: without compilation, JAX would dispatch dozens of operations one by one. Inside the package,
+larger programs call the uncompiled functions.
 """
 
 from collections.abc import Callable
@@ -34,9 +34,9 @@ Result = TypeVar("Result")
 
 
 def compiled(function: Callable[Arguments, Result], numeric: Callable[..., Any] | None = None) -> Callable[Arguments, Result]:
-    """Compile a function of a mechanism and of numbers, once for all mechanisms of the same structure.
+    """Return a compiled version of a function of a mechanism and of numbers, for all mechanisms of the same structure.
 
-    The result can be transformed like the function itself. An `analysis` argument is computed before the numbers are traced.
+    It can be transformed like the function itself. An `analysis` argument is computed before the numbers are traced.
 
     Args:
         function: Its first argument is the `mechanism`; all others except `analysis` are numbers or arrays.

@@ -182,7 +182,10 @@ def violation(mechanism: Mechanism | ConstrainedSystem, solution: Annotated[Hist
 
 
 def _over_values(mechanism: Any, psi: Float[Array, "T m"], driver: str, values: Any) -> Float[Array, "T m"]:
-    """Convert Psi with all drivers at time 0 to Psi along values of one; rows of others are relative to the first position."""
+    """Convert Psi with all drivers at time 0 to Psi along the values of one driver.
+
+    The rows of all other drivers are relative to the first position that is finite.
+    """
     names = mechanism.driver_names
     if not names:
         return psi

@@ -1,7 +1,7 @@
 """Loads of joints on their bodies, -Psi_q^T lambda: in chosen axes, about a chosen point, with a chosen rule for sharing.
 
-With redundant constraints, equilibrium determines only some components (determinacy.py). The others require an assumption: by
-default the least norm, each row in units of its scale; or the least elastic energy (compliance.py).
+With redundant constraints, equilibrium determines only some components (determinacy.py). Other components require an assumption:
+by default the least norm, each row in units of its scale; or the least elastic energy (compliance.py).
 """
 
 from collections.abc import Callable, Mapping
@@ -139,9 +139,9 @@ def _loads_of_rows(system: Any, ts: Array, q: Array, v: Array, method: Pseudoinv
 
 
 def _name_by_body(scene: SceneAlong, values: list[list[Array]], join: Callable[[Array, Array], Array]) -> ByBody:
-    """Return values by the names of their constraints and bodies, in order; dictionaries would lose the order under `jit`.
+    """Return `values`, listed by constraint and by body, as dictionaries by name; under `jit` these would lose their order.
 
-    Constraints of one name, which hold one after another, are joined.
+    The values of constraints with one public name, which hold one after another, are joined.
     """
     constraints, found = scene.mechanism.constraints, {}
     bodies = {name: [b for b in dict.fromkeys(scene.mechanism.frames_of(x)) if b != GROUND] for name, x in constraints.items()}
@@ -165,7 +165,10 @@ def _split_by_body(
     frame: Axes,
     about: About,
 ) -> ByBody:
-    """Split the loads of rows (T, m, n) by joint and body, (rows, T, 3) each, in the chosen axes and about the chosen point."""
+    """Return the loads of joints on bodies, in the chosen axes and about the chosen point, from the loads of rows (T, m, n).
+
+    `total` converts the loads of a joint's rows on a body, (rows, T, 3), before axes and point are chosen.
+    """
     body_index = {name: k for k, name in enumerate(mechanism.body_names)}
     body_frames = {name: _frame(q, index) for name, index in body_index.items()} | {GROUND: GROUND_FRAME}
     result: ByBody = {}
@@ -187,7 +190,7 @@ def _split_by_body(
 
 
 def _rows_by_owner(row_names: list[str]) -> dict[str, list[int]]:
-    """Return the rows of each constraint."""
+    """Return the indices of the rows of each constraint, from the constraint of each row."""
     rows: dict[str, list[int]] = {}
     for k, owner in enumerate(row_names):
         rows.setdefault(owner, []).append(k)
@@ -239,7 +242,7 @@ def _states(solution: HistoryLike) -> tuple[Array, Array, Array]:
 
 @deferred
 def _loads(mechanism, analysis, knowledge, ts, q, v, method, baumgarte, soft, frame, about):
-    """Compute -Psi_q^T lambda of each constraint on each of its bodies (T, 3)."""
+    """Return lists of the loads -Psi_q^T lambda (T, 3) on the bodies of each constraint."""
     equations = prepare(mechanism, method, baumgarte, analysis).with_compliances(soft)
 
     def row_loads(equations, t, q, v, known):
@@ -253,7 +256,7 @@ def _loads(mechanism, analysis, knowledge, ts, q, v, method, baumgarte, soft, fr
 
 
 def _is_unique(coefficients: Any, N: Any, unit: Any, xp: ArrayLibrary) -> Any:
-    """Return whether c^T N = 0, from the coefficients c (rows, T, 3) of components and their rows (T, rows, m) of N.
+    """Return True where c^T N = 0, for coefficients c (rows, T, 3) of three components, and the rows (T, rows, m) of N.
 
     `unit` are the units of the components: a torque over the length is a force.
     """
@@ -263,7 +266,7 @@ def _is_unique(coefficients: Any, N: Any, unit: Any, xp: ArrayLibrary) -> Any:
 
 @deferred
 def _uniqueness_of_loads(mechanism, analysis, knowledge, ts, q, rank_tol, frame, about):
-    """Return whether equilibrium determines each component of `_loads`, from Psi_q (T, m, n) and N (T, m, m) of scaled rows."""
+    """Return lists as `_loads` does, with marks (T, 3) of the components that equilibrium determines."""
 
     def terms(t, q, known):
         scene = known.put_in(mechanism)
@@ -287,7 +290,7 @@ def _uniqueness_of_loads(mechanism, analysis, knowledge, ts, q, rank_tol, frame,
 def _loads_by_numpy(
     mechanism: Mechanism, analysis: Analysis, history: StateArraysOverTime, *choices: Any, frame: Axes, about: About
 ) -> list[list[Array]]:
-    """Compute the results of `_loads` by NumPy, for concrete numbers."""
+    """Return the results of `_loads` by NumPy, for concrete numbers."""
     arrays, rows = state_arrays(mechanism), [name for name, _ in analysis.row_names]
 
     def of_piece(ts: np.ndarray, q: np.ndarray, v: np.ndarray) -> ByBody:
@@ -302,7 +305,7 @@ def _loads_by_numpy(
 def _uniqueness_by_numpy(
     mechanism: Mechanism, analysis: Analysis, history: tuple[np.ndarray, np.ndarray], rank_tol: Any, frame: Axes, about: About
 ) -> list[list[Array]]:
-    """Return the results of `_uniqueness_of_loads`."""
+    """Return the results of `_uniqueness_of_loads` by NumPy, for concrete numbers."""
     arrays, rows = state_arrays(mechanism), [name for name, _ in analysis.row_names]
     rows_of, scales = _rows_by_owner(rows), np.asarray(analysis.row_units)
     unit = np.stack([1.0, 1.0, float(analysis.length)])
@@ -321,7 +324,7 @@ def _uniqueness_by_numpy(
 
 
 def _joined(arrays: StateArrays, history: tuple[np.ndarray, ...], of_piece: Callable[..., ByBody]) -> list[list[Array]]:
-    """Evaluate a quantity of each constraint and body in pieces of a history, and join them."""
+    """Return a quantity of each constraint and body along a history, evaluated in pieces, as lists by constraint and body."""
     pieces = [of_piece(*(x[p] for x in history)) for p in arrays.pieces(len(history[0]))]
     return put_arrays(
         [[np.concatenate([piece[name][body] for piece in pieces]) for body in loads] for name, loads in pieces[0].items()]

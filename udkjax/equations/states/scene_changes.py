@@ -52,7 +52,7 @@ class SceneChanges(eqx.Module):
 
     @property
     def by_name(self) -> dict[str, Bool[Array, "T"]]:
-        """Masks of the output times at which each constraint holds."""
+        """Masks of the output times at which constraints hold, by the names by which results list the constraints."""
         found: dict[str, Any] = {}
         for k, name in enumerate(self.public):
             found[name] = found[name] | self.holds[..., k] if name in found else self.holds[..., k]
@@ -65,7 +65,7 @@ class SceneChanges(eqx.Module):
 
     @property
     def is_known(self) -> bool:
-        """True if the joints that events add, and contacts, are known."""
+        """True if the joints that events add are known, and so are contacts."""
         return self.form is not None
 
     def __getstate__(self) -> dict[str, Any]:
@@ -84,7 +84,7 @@ class SceneChanges(eqx.Module):
 
     @staticmethod
     def write(changes: "SceneChanges | None", data: Any) -> None:
-        """Add `holds`, over time and constraint, to an xarray Dataset; None: its run has not changed the scene."""
+        """Add `holds`, over time and constraint, to the xarray Dataset of a run; None: the run has not changed the scene."""
         data.attrs[OF_SCENE] = -1 if changes is None else changes.of_scene
         if changes is not None:
             data["holds"] = ("time", "constraint"), np.asarray(changes.holds).astype(np.int8)
@@ -93,7 +93,7 @@ class SceneChanges(eqx.Module):
 
     @classmethod
     def read(cls, data: Any, had_events: bool) -> "SceneChanges | None":
-        """Read what `write` has added to a dataset; joints that events have added are unknown.
+        """Return the changes that `write` has added to a dataset, in which added joints are unknown; None if nothing has changed.
 
         Args:
             data: The dataset. If `write` has added nothing, an older version has written it.
@@ -108,7 +108,7 @@ class SceneChanges(eqx.Module):
         return cls(holds, np.zeros((times, 0, 0)), (), None, names, names, of_scene)
 
     def scene(self, mechanism: Mechanism) -> Mechanism:
-        """Return a mechanism with all constraints of the run."""
+        """Return the mechanism with all constraints of the run, those that events change with a switch."""
         joints, friction = self.elements
         known = [name for name in self.names[: self.of_scene] if name in mechanism.constraints]
         others = dict(zip(self.names[self.of_scene :], joints, strict=False))
@@ -117,14 +117,14 @@ class SceneChanges(eqx.Module):
         return with_switches(mechanism, known, others, friction)
 
     def constraints_of(self, mechanism: Mechanism) -> dict[str, list[str]]:
-        """Return the constraints of `scene` by the name by which results list them, those of the mechanism first."""
+        """Return the names of the constraints of `scene`, listed by their names in results; the mechanism's own come first."""
         found = {name: [name] for name in mechanism.constraints}
         for name, public in list(zip(self.names, self.public, strict=True))[self.of_scene :]:
             found.setdefault(public, []).append(name)
         return found
 
     def rows_that_hold(self, mechanism: Any) -> Bool[Array, "T m"]:
-        """Return a mask of the rows of a mechanism whose constraints hold."""
+        """Return a mask over output times and rows of a mechanism: True where the constraint of the row holds."""
         own = self.names[: self.of_scene]
         owners = [name for name, _ in analyse(mechanism).row_names]
         places = np.array([own.index(name) if name in own else self.of_scene for name in owners], int)
@@ -133,23 +133,23 @@ class SceneChanges(eqx.Module):
 
     @property
     def are_released(self) -> Bool[Array, "T"]:
-        """True if events have released a constraint of the scene."""
+        """A mask of the output times at which a constraint of the scene is released."""
         return ~jnp.all(self.holds[:, : self.of_scene], axis=1)
 
     @property
     def is_unknown(self) -> Bool[Array, "T"]:
-        """True where constraints hold that are not known."""
+        """A mask of the output times at which constraints hold that are not known."""
         return jnp.any(self.holds[:, self.of_scene :], axis=1) & (not self.is_known)
 
 
 class _Form(NamedTuple):
-    """The structure of added joints and contacts, and their leaves that are no arrays; hashable."""
+    """The structure of added joints, contacts and their friction, and their leaves other than arrays; hashable."""
 
     tree: TreeDef
     others: tuple[Any, ...]  # None in place of arrays
 
     def put(self, numbers: Sequence[Array]) -> tuple[list[Any], dict[str, Friction]]:
-        """Return the joints, and the friction, with these numbers."""
+        """Return the added joints and contacts, and the friction of contacts, with the arrays `numbers`."""
         following = iter(numbers)
         return jax.tree.unflatten(self.tree, [next(following) if x is None else x for x in self.others])
 
@@ -186,7 +186,7 @@ class KnownState(eqx.Module):
     driver: str = eqx.field(static=True, default="")
 
     def put_in(self, mechanism: Mechanism) -> Mechanism:
-        """Return the scene of this state; its loads are NaN if it is not known."""
+        """Return the mechanism with the constraints of this state; gravity, and so all loads, are NaN if these are not known."""
         if self.driven is not None:
             k = mechanism.driver_names.index(self.driver)
             mechanism = eqx.tree_at(lambda m: m._drivers[k].motion.coefficients, mechanism, self.driven)
@@ -205,7 +205,7 @@ class KnownState(eqx.Module):
 
 
 class Knowledge(NamedTuple):
-    """Changes of the constraints known along a motion, at its times T: by joints that stick, and by events."""
+    """Knowledge of constraints along a motion, at its T times: joints that stick, changes by events, and a driver's motion."""
 
     sticking: Bool[Array, "T F"] | None
     changes: SceneChanges | None
@@ -218,7 +218,7 @@ class Knowledge(NamedTuple):
         return self.changes is None and self.driven is None
 
     def states(self, mechanism: Mechanism) -> KnownState:
-        """Return the constraints at each time, for the mechanism with all constraints of the run."""
+        """Return the known states at all times, with a leading axis T, for the mechanism with all constraints of the run."""
         changes = self.changes
         if changes is None:
             return KnownState(self.sticking, driven=self.driven, driver=self.driver)
@@ -242,7 +242,7 @@ class Knowledge(NamedTuple):
 
 
 class SceneAlong(NamedTuple):
-    """A mechanism with all constraints that hold along a motion, its analysis, and which of them hold when."""
+    """A mechanism with all constraints that hold along a motion, its analysis, and the times at which each of them holds."""
 
     mechanism: Mechanism
     analysis: Analysis
@@ -252,12 +252,12 @@ class SceneAlong(NamedTuple):
     is_kinematic: bool = False  # whether the motion is that of a `Kinematics` over the values of a driver
 
     def gains(self, stabilization: Baumgarte | None) -> Baumgarte | None:
-        """Return the gains of Baumgarte's terms, of which a kinematic motion has none."""
+        """Return the given gains of Baumgarte's terms; None for a kinematic motion, which has no such terms."""
         return None if self.is_kinematic else stabilization
 
 
 def scene_along(mechanism: Any, solution: Any) -> SceneAlong:
-    """Return the mechanism in which the states of a motion are evaluated.
+    """Return the mechanism in which the states of a motion are evaluated, and the constraints that hold.
 
     Args:
         mechanism: The scene.
@@ -286,7 +286,10 @@ def scene_along(mechanism: Any, solution: Any) -> SceneAlong:
 
 
 def _over_values(mechanism: Mechanism, motion: Any, analysis: Analysis, ts: np.ndarray) -> SceneAlong:
-    """Return the mechanism along a `Kinematics`, which has the driver's values at time 0; all other drivers hold theirs."""
+    """Return the mechanism along a `Kinematics` over the values of a driver.
+
+    At time 0 its driver has the value, rate and acceleration of each state; all other drivers are at rest.
+    """
     name, scene = motion.values_of, mechanism.without_origin
     if name not in mechanism.driver_names:
         return SceneAlong(_with_motions(scene), analysis, Knowledge(None, None), None, ts, True)
@@ -303,7 +306,7 @@ def _over_values(mechanism: Mechanism, motion: Any, analysis: Analysis, ts: np.n
 
 @cached_by_identity(within_trace=True)
 def _with_motions(mechanism: Mechanism, name: str = "", rate: float = 0.0, acceleration: float = 0.0) -> Mechanism:
-    """Return the mechanism with a driver of this rate and acceleration at time 0; all others are at rest."""
+    """Return the mechanism in which the driver `name` has a rate and an acceleration at time 0, and all others are at rest."""
     moving, resting = Polynomial(np.array([0.0, rate, 0.5 * acceleration])), Polynomial(np.zeros(1))
     drivers = mechanism.drivers.items()
     return mechanism.with_drivers(

@@ -33,10 +33,11 @@ DENSE_ARRAYS = 8  # of the size of Psi_q, which a state needs at once
 
 
 def by_numpy(mechanism: Any, numbers: PyTree, method: Pseudoinverse | None = None) -> TypeGuard[Mechanism]:
-    """Return whether `StateArrays` has the quantities of a mechanism: its numbers and the given ones are concrete.
+    """Return whether `StateArrays` can compute quantities of a mechanism.
 
-    `method` must be the SVD, or what stands for it; numbers of the mechanism must not be samples over time, and its friction must
-    neither depend on the loads of joints nor be set-valued.
+    All numbers of the mechanism and all `numbers` must be concrete, float64 must be enabled, and no `jit` be active. `method`
+    must be `SVD`, or `Auto` or None, which stand for it here. No number of the mechanism may be sampled over time, and its
+    friction must neither depend on the loads of joints nor be set-valued.
     """
     config = jax.config
     return (
@@ -60,14 +61,14 @@ StateArraysOverTime: TypeAlias = tuple[np.ndarray, np.ndarray, np.ndarray]  # ti
 
 
 def history_of(solution: HistoryLike) -> StateArraysOverTime:
-    """Return times (T,), coordinates and velocities (T, n) as NumPy arrays."""
+    """Return the times (T,), coordinates and velocities (T, n) of a solution as NumPy arrays; see `times_of`."""
     ts = np.asarray(times_of(solution), float)
     q, v = (np.asarray(x, float).reshape(len(ts), -1) for x in (solution.q, solution.v))
     return ts, q, v
 
 
 class Multipliers(NamedTuple):
-    """Accelerations and multipliers at T states."""
+    """Accelerations, multipliers and Psi_q at T states."""
 
     a: np.ndarray  # (T, n)
     multipliers: np.ndarray  # (T, m)
@@ -75,7 +76,7 @@ class Multipliers(NamedTuple):
 
 
 class StateArrays:
-    """Quantities of a mechanism with concrete numbers: t (T,), q and v (T, n)."""
+    """Quantities of a mechanism with concrete numbers, as functions of T states: t (T,), q and v (T, n)."""
 
     def __init__(self, mechanism: Mechanism):
         self._at: SceneArrays[np.ndarray] = arrays_in_time(mechanism)(0.0)
@@ -90,13 +91,13 @@ class StateArrays:
         self._weight = self.mass * np.tile([*np.asarray(mechanism.gravity, float), 0.0], self.size // 3)
 
     def pieces(self, count: int, dense: bool = True) -> Iterator[slice]:
-        """Iterate over pieces of `count` states, by their memory; `dense` if Psi_q is a dense matrix."""
+        """Iterate over slices of `count` states that need little memory at once; `dense` if Psi_q is stored as a dense matrix."""
         numbers = DENSE_ARRAYS * max(self.count * self.size, 1) if dense else 64 * (self.size + self.count)
         step = max(1, PIECE // (8 * numbers))
         return (slice(k, k + step) for k in range(0, max(count, 1), step))
 
     def _evaluate(self, quantity: Callable[..., Any], t: np.ndarray, q: np.ndarray, v: np.ndarray) -> Any:
-        """Evaluate a quantity of `SceneArrays` at states, a single one by vectors: floats are faster than arrays."""
+        """Return a quantity of `SceneArrays` at states, (..., T); a single state is passed as vectors, which is faster."""
         if len(t) == 1:
             return jax.tree.map(lambda x: x[:, None], quantity(t[0], q[0], v[0]))
         return quantity(t, q.T, v.T)
@@ -137,7 +138,7 @@ class StateArrays:
         return self._evaluate(lambda t, q, v: self._at.jacobian(t, q), t, q, q)
 
     def largest_row(self, entries: np.ndarray) -> np.ndarray:
-        """Return the largest absolute sum (T,) of the entries (entries, T) of a row."""
+        """Return the largest absolute value (T,) of the sums of `entries` (entries, T) over each row of Psi_q."""
         ordered = entries[self._in_rows]
         return np.abs([ordered[row].sum(0) for row in self._rows]).max(0)
 
@@ -221,7 +222,7 @@ def _least_norm(D: np.ndarray, b: np.ndarray, tol: float) -> tuple[np.ndarray, n
 
 @cached_by_identity
 def state_arrays(mechanism: Mechanism) -> StateArrays:
-    """Return the quantities of a mechanism by NumPy, made once for each mechanism.
+    """Return the `StateArrays` of a mechanism, made once for each mechanism.
 
     Args:
         mechanism: The scene; its numbers are concrete.

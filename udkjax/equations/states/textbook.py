@@ -44,7 +44,7 @@ class TextbookEquations(ConstrainedRows):
     sticking: Bool[Array, "F"] | None = None  # the joints that are known to stick; None: the law decides
 
     def size(self, dq: Vector) -> Float[Array, ""]:
-        """Return the largest component of a change of coordinates: lengths per characteristic length, angles in rad."""
+        """Return the largest component of a change of coordinates: displacements in characteristic lengths, angles in rad."""
         return self.scales.size(dq)
 
     def violation_size(self, psi: Float[Array, "m"]) -> Float[Array, ""]:
@@ -65,7 +65,7 @@ class TextbookEquations(ConstrainedRows):
         return uk.multipliers(*given)
 
     def motion(self, t: Time, q: Vector, v: Vector) -> tuple[Vector, Float[Array, "m"]]:
-        """Return a and lambda."""
+        """Return a (n,) and lambda (m,) of one solution, with the friction that depends on lambda."""
         if self.sticks:
             multipliers, friction, _ = self._sticking_state.loads(t, q, v)
         else:
@@ -98,15 +98,15 @@ class TextbookEquations(ConstrainedRows):
 
     @property
     def sticks(self) -> bool:
-        """True if friction is set-valued."""
+        """True if any friction of the mechanism is set-valued."""
         return Friction.may_stick(self.mechanism._forces)
 
     def with_compliances(self, soft: Float[Array, "m"] | None) -> "TextbookEquations":
-        """Return the equations whose redundant forces are shared by the compliances of the rows."""
+        """Return the equations in which redundant forces are shared by the compliances of rows; None: by least norm."""
         return replace(self, soft=soft)
 
     def known(self, state: KnownState) -> "TextbookEquations":
-        """Return the equations at a state of a motion: of the constraints that hold, with the joints that are known to stick."""
+        """Return the equations for the constraints that hold at a state of a motion, and the joints that are known to stick."""
         return replace(self, mechanism=state.put_in(self.mechanism), sticking=state.sticking)
 
     def rubbing_powers(self, t: Time, q: Vector, v: Vector, multipliers: Float[Array, "m"]) -> dict[str, Array]:
@@ -115,11 +115,11 @@ class TextbookEquations(ConstrainedRows):
         return {joint: v @ drag for joint, drag in drags.items()}
 
     def rubbing_terms(self, q: Vector, v: Vector, multipliers: Float[Array, "m"]) -> dict[str, Float[Array, "3"]]:
-        """Return the speed of sliding s (m/s), mu(s) and the load (N) of each friction that depends on it, by joint."""
+        """Return the speed of sliding s (m/s), mu(s) and the load (N) of each friction that depends on a load, by joint."""
         return rubbing.terms_of_rubbing(self.mechanism, q, v, multipliers)
 
     def loose_friction(self, t: Time, q: Vector, N: Float[Array, "m k"]) -> LooseFriction:
-        """Return which joints with friction have a load that is not unique: see `loose_friction`."""
+        """Find the joints with friction whose loads are not unique: see `loose_friction`."""
         return loose_friction(self.mechanism, t, q, N, self.scales)
 
     @property
@@ -133,15 +133,18 @@ class TextbookEquations(ConstrainedRows):
         return bool(self.rubbing_joints)
 
     def rank(self, t: Time, q: Vector, v: Vector | None = None) -> Int[Array, ""]:
-        """Return the rank of D at q by the method's threshold."""
+        """Return the rank of D at a position, by the threshold of the pseudoinverse."""
         return uk.pseudoinverse(self.method, uk.D(self.mechanism, t, q, self.scales.weights)).rank
 
     def project(self, t: Time, q: Vector, v: Vector) -> tuple[Vector, Vector]:
-        """Project q and v onto Psi = 0 and Psi_dot = 0 by the smallest change in the mass metric: see `correct`."""
+        """Return q and v projected onto Psi = 0 and Psi_dot = 0, by the smallest change in the metric of M."""
         return _project(self, t, q, v)
 
     def correct(self, t: Time, q: Vector, v: Vector) -> tuple[Vector, Vector]:
-        """Take a Newton step in position and one in velocity; on the manifold the result has the derivatives of a projection."""
+        """Return q and v after a Newton step in position and a Newton step in velocity.
+
+        For a state on the manifold the result has the derivatives of a projection.
+        """
         return uk.project(self.mechanism, t, q, v, self.method, self.weights, steps=1)
 
     def tangent_part(self, t: Time, q: Vector, v: Vector, dq: Vector, dv: Vector) -> TangentPart:
@@ -154,7 +157,7 @@ class TextbookEquations(ConstrainedRows):
         return TangentPart(*tangent(jnp.stack([dq, dv])))
 
     def violation(self, t: Time, q: Vector, v: Vector) -> tuple[Array, Array]:
-        """Return Psi and Psi_dot of all rows."""
+        """Return Psi (m,) and Psi_dot (m,) of all rows."""
         return constraints.psi(self.mechanism, t, q), constraints.psi_dot(self.mechanism, t, q, v)
 
     def is_finite(self, t: Time, q: Vector, v: Vector) -> Bool[Array, ""]:
@@ -184,7 +187,7 @@ class TextbookEquations(ConstrainedRows):
         return uk.D(self.mechanism, t, q, w), rate, uk.inverse_sqrt_mass(self.mechanism)
 
     def _weights_of_positions(self, w: Float[Array, "m"]) -> Float[Array, "m"]:
-        """Return weights in which rows that restrict velocities alone are left out."""
+        """Return the weights w with zeros for the rows that restrict velocities alone, which are then left out."""
         rolling = constraints.rolling_rows(self.mechanism)
         return jnp.where(rolling, 0.0, w) if rolling.any() else w
 
@@ -208,14 +211,17 @@ class TextbookEquations(ConstrainedRows):
 
     @property
     def weights(self) -> Float[Array, "m"]:
-        """The weights of the rows; in elimination redundant rows have weight zero, as small pivots look like rounding errors."""
+        """The weights of the rows; redundant rows have weight zero if the method is `Elimination`.
+
+        Elimination could not tell their small pivots from rounding errors.
+        """
         if not isinstance(self.method, Elimination) or not self.redundant:
             return self.scales.weights
         return self.scales.weights.at[np.array(self.redundant)].set(0.0)
 
     @property
     def programs(self) -> ScenePrograms:
-        """The programs of the scene: if redundant rows are unknown, `Elimination` drops them, and other methods need marks."""
+        """The programs of the scene: if redundant rows are unknown, `Elimination` drops them, and others need marks of rows."""
         redundant = () if self.redundant is None and isinstance(self.method, Elimination) else self.redundant
         shares = LoadShares.NONE
         if self.rubs and redundant != () and not self.only_switched:
@@ -232,7 +238,7 @@ class TextbookEquations(ConstrainedRows):
 
     @property
     def row_names(self) -> list[tuple[str, int]]:
-        """The constraint that each row of Psi belongs to, and the row's index within it."""
+        """For each row of Psi, the name of its constraint, and its index among the rows of this constraint."""
         return constraints.row_names(self.mechanism)
 
     @property
@@ -262,7 +268,7 @@ def prepare(
     baumgarte: Baumgarte | None = None,
     analysis: Analysis | None = None,
 ) -> TextbookEquations:
-    """Prepare the equations of motion of a mechanism by a pseudoinverse.
+    """Return the equations of motion of a mechanism, by a pseudoinverse.
 
     Args:
         mechanism: The scene; its numbers may be traced.

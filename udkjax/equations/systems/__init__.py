@@ -1,4 +1,4 @@
-"""User-defined systems, with any mass matrix and constraints: traced once, and written as the programs of a scene.
+"""User-defined systems, with any mass matrix and constraints: they are traced once, and their programs are like those of a scene.
 
-Their programs have the names and results of those in `programs`, so that machine code and studies need not distinguish them.
+These have the names and results of the programs in `programs`, so that machine code and studies need not distinguish the two.
 """

@@ -103,7 +103,7 @@ class ConstrainedSystem(PrintsLine, Model):
 
     @property
     def is_concrete(self) -> bool:
-        """True if no number is traced, neither a field nor one that a function closes over."""
+        """True if no number is traced, neither a field nor a number that a function closes over."""
         if is_traced(self):
             return False
         traced = self if self.q0 is None else self.traced(np.size(self.q0))
@@ -117,9 +117,9 @@ class ConstrainedSystem(PrintsLine, Model):
         return self.with_parameters({"q0": q, "v0": v})
 
     def traced(self, n: int) -> Any:
-        """Return the system with functions that are traced for n coordinates; unchanged without float64, for JAX alone.
+        """Return the `TracedSystem` from which programs are made, for n coordinates; without float64 the system itself.
 
-        All its numbers are leaves then, also those that functions hold in their closures.
+        All numbers of a `TracedSystem` are leaves, also those that functions hold in their closures.
         """
         return trace_system(self, n) if jax.config.jax_enable_x64 else self
 
@@ -159,7 +159,7 @@ class GeneralEquations(ConstrainedRows):
 
     @property
     def programs(self) -> RunPrograms | None:
-        """The programs of a traced system; `Elimination` drops dependent rows, all other methods need marks as input."""
+        """The programs of a traced system: `Elimination` drops dependent rows, all other methods need marks of rows as input."""
         if not self.mechanism.has_programs:
             return None
         marks_rows, policy = not isinstance(self.method, Elimination), RankPolicy.of(self.method)
@@ -175,7 +175,7 @@ class GeneralEquations(ConstrainedRows):
 
     @property
     def scales(self) -> Scales:
-        """Units of one: coordinates are of order one."""
+        """The scales of a system: all units are one, since its coordinates are of order one."""
         one: Any = np.ones(())  # NumPy's numbers, since each run asks for them
         rows: Any = np.ones(sum(self.mechanism.functions.row_counts) if self.mechanism.has_programs else 0)
         tol: Any = np.asarray(RANK_TOL)
@@ -190,7 +190,7 @@ class GeneralEquations(ConstrainedRows):
         return jnp.zeros(0) if plus is None else -(plus.T @ (plus @ b))
 
     def project(self, t: Time, q: Vector, v: Vector) -> tuple[Vector, Vector]:
-        """Take two Newton steps in position and two in velocity, because phi may be nonlinear."""
+        """Return q and v after two Newton steps in position and two in velocity, because phi may be nonlinear."""
         for _ in range(2):
             q = self.correct_position(t, q)
         for _ in range(2):
@@ -198,26 +198,32 @@ class GeneralEquations(ConstrainedRows):
         return q, v
 
     def correct(self, t: Time, q: Vector, v: Vector) -> tuple[Vector, Vector]:
-        """Take a Newton step in position and one in velocity; on the manifold the result has the derivatives of a projection."""
+        """Return q and v after a Newton step in position and a Newton step in velocity.
+
+        For a state on the manifold the result has the derivatives of a projection.
+        """
         q = self.correct_position(t, q)
         return q, self.correct_velocity(t, q, v)
 
     def correct_position(self, t: Time, q: Vector) -> Vector:
-        """Take a Newton step to Psi = 0."""
+        """Return q after a Newton step to Psi = 0."""
         if self.mechanism.constraint is None:
             return q
         plus, weight = self._plus(q, jax.jacfwd(self._psi, 1)(t, q))
         return q - weight(plus @ self._psi(t, q))
 
     def correct_velocity(self, t: Time, q: Vector, v: Vector) -> Vector:
-        """Take a Newton step to Psi_dot = 0 and phi = 0."""
+        """Return v after a Newton step to Psi_dot = 0 and phi = 0."""
         if not self.constrained:
             return v
         plus, weight = self._plus(q, self._slopes(t, q, v))
         return v - weight(plus @ jnp.concatenate([self._psi_dot(t, q, v), self._phi(t, q, v)]))
 
     def tangent_part(self, t: Time, q: Vector, v: Vector, dq: Vector, dv: Vector) -> TangentPart:
-        """Return (I - L^(-T) D^+ A) of two vectors, with A = Psi_q for dq; with phi, dv follows dq in Psi_dot = 0 and phi = 0."""
+        """Return (I - L^(-T) D^+ A) dq and (I - L^(-T) D^+ A) dv, with A = Psi_q for dq and A = (Psi_q; phi_v) for dv.
+
+        If there is a phi, the change of Psi_dot and phi by the tangent part of dq is added to A dv.
+        """
         if self.mechanism.constraint is not None:
             slopes = jax.jacfwd(self._psi, 1)(t, q)
             plus, weight = self._plus(q, slopes)
@@ -232,7 +238,7 @@ class GeneralEquations(ConstrainedRows):
         return TangentPart(dq, dv)
 
     def impulse(self, t: Time, q: Vector, v: Vector, normal: Vector) -> tuple[Vector, Vector]:
-        """Return M^(-1) n, and its part that all rows allow: the change of velocities by a unit impulse along n."""
+        """Return M^(-1) n for n = `normal`, and its tangent part: the change of velocities by a unit impulse along n."""
         factor = jax.scipy.linalg.cho_factor(jnp.asarray(self.mechanism.mass(q)), lower=True)
         mobility = jax.scipy.linalg.cho_solve(factor, normal)
         return mobility, self.tangent_part(t, q, v, jnp.zeros_like(q), mobility).dv
@@ -351,7 +357,10 @@ class GeneralEquations(ConstrainedRows):
 
 
 def prepare_general(system: Any, method: Pseudoinverse | None, baumgarte: Baumgarte | None) -> GeneralEquations:
-    """Choose a method, by default `Auto`, which is `SVD` for dense rows."""
+    """Prepare the equations of motion of a user-defined system by a pseudoinverse.
+
+    The default method is `Auto`, which is `SVD` for dense rows. The `rank_tol` of a method without one is `RANK_TOL`.
+    """
     system = replace(system, breakpoints=None) if isinstance(system, TracedSystem) else system  # the run has them
     method = Auto() if method is None else method
     tol = number(RANK_TOL) if method.rank_tol is None else method.rank_tol

@@ -21,7 +21,7 @@ from udkjax.scene.elements.forces import ForceElement
 
 
 class SmoothLoads:
-    """The programs of loads with held sides, compared by identity, so that equal loads share compiled code.
+    """The programs of loads with held sides. Equal loads have the same object, and so share compiled code.
 
     Args:
         graph: The graph of the loads.
@@ -30,6 +30,14 @@ class SmoothLoads:
         loads: The loads.
         moving: The groups of inputs that change during a motion.
         kind: The structure of the element; None for a system.
+
+    Attributes:
+        count: The number of sides.
+        has_opaque: True if the loads contain loops or branches whose kinks are unknown.
+        turns: For each condition, the index of the side that changes where the condition crosses zero, and the factor and the
+            shift that make the new side of the old one.
+        renewal: Program of the sides at a state.
+        by_velocity: True for each condition that depends on velocities.
     """
 
     def __init__(
@@ -52,19 +60,19 @@ class SmoothLoads:
         self.by_velocity = [any(map(program.uses, v)) for program in self._conditions]
 
     def inputs(self, numbers: Sequence[Any], t: Any, q: Iterable[Any], v: Iterable[Any], sides: Iterable[Any]) -> list[Any]:
-        """Return the values of the inputs of all programs."""
+        """Return the values of the inputs of the programs in their order, without structural zeros among the numbers."""
         return [*(numbers[k] for k in self._used), t, *q, *v, *sides]
 
     def loads(self, of: Any, sides: Any, t: Any, q: Iterable[Any], v: Iterable[Any]) -> list[Any]:
-        """Return the loads of a force element, or of a system with the numbers `of`."""
+        """Return the loads at a state with held sides; `of` is the force element, or the numbers of the system."""
         return self._loads(self.inputs(SmoothLoads.numbers(of), t, q, v, sides))
 
     def condition(self, index: int, of: Any, sides: Any, t: Any, q: Iterable[Any], v: Iterable[Any]) -> Any:
-        """Return the value of the condition with this index: the load changes its smooth form where it crosses zero."""
+        """Return the value of a condition by its index: where it crosses zero, the loads change their smooth form."""
         return self._conditions[index](self.inputs(SmoothLoads.numbers(of), t, q, v, sides))[0]
 
     def state(self, frames: Sequence[Frame]) -> tuple[list[Any], list[Any]]:
-        """Return q and v of the moving bodies; v is zero for frames without velocities."""
+        """Return q and v of the bodies of an element, from all of its frames; v is zero for frames without velocities."""
         assert self.kind is not None  # loads of an element
         moving = [f for f, fixed in zip(frames, self.kind.ground, strict=True) if not fixed]
         q, v = ([getattr(f, x) for f in moving for x in names] for names in (("x", "y", "angle"), ("vx", "vy", "omega")))
@@ -77,12 +85,15 @@ class SmoothLoads:
 
     @classmethod
     def of_element(cls, element: ForceElement, frames: Sequence[str], breaks: bool) -> "SmoothLoads":
-        """Return the smooth loads of an element attached to `frames`; its breakpoints, if any, are all of its kinks in time."""
+        """Return the smooth loads of an element attached to `frames`, names of bodies or the ground.
+
+        `breaks`: breakpoints list all kinks in time, so that comparisons of time alone are not held.
+        """
         return _of_element(traced_loads(element, frames), breaks)
 
     @classmethod
     def of_functions(cls, functions: SystemFunctions, breaks: bool) -> "SmoothLoads":
-        """Return the smooth loads of a system."""
+        """Return the smooth loads of a system; `breaks` is as in `of_element`."""
         return _of_functions(functions, breaks)
 
     def held(self, functions: SystemFunctions) -> SystemFunctions:

@@ -27,7 +27,7 @@ RIGHT, SOLUTION, FACTORS = "right", "x0", "factors"  # arrays; `right1` and `rig
 
 
 class SystemEquation:
-    """One equation: its load F, rows A and right-hand side c, by elimination of the first `count` rows."""
+    """An equation M w = F + A^T x, A w = c: mass matrix, load F, and the first `count` of the rows A and right-hand sides c."""
 
     def __init__(
         self, mass: Sequence[SparseRow], load: Sequence[Scalar], A: Sequence[SparseRow], c: Sequence[Scalar], count: int
@@ -35,7 +35,7 @@ class SystemEquation:
         self.mass, self.load, self.A, self.c, self.count = mass, load, A[:count], c[:count], count
 
     def residual(self, w: Sequence[Scalar], x: Sequence[Scalar]) -> list[Scalar]:
-        """Return r_w and r_x."""
+        """Return r_w, followed by r_x."""
         zero = w[0].graph.constant(0.0)
         moved = [s - sum((m * w[k] for k, m in row.items()), zero) for s, row in zip(self.load, self.mass, strict=True)]
         for row, s in zip(self.A, x, strict=False):
@@ -77,7 +77,7 @@ class DifferentiableSystem:
 
     @cached_property
     def _accelerations(self) -> DifferentiableProgram:
-        """Compute a; set safe."""
+        """The program that computes a and `safe`, with the loops of its derivatives."""
         equation, factors, reports = self._of_accelerations
         a, x = factors.respond(equation.load, equation.c)
         evaluation = self._loop({"a": a, SOLUTION: [*a, *x], FACTORS: factors.numbers}, reports)
@@ -88,7 +88,7 @@ class DifferentiableSystem:
 
     @cached_property
     def _projection(self) -> DifferentiableProgram:
-        """Compute q1 and v1 of a state on the manifold, where they equal q and v."""
+        """The program that computes q1 and v1 of a state on the manifold, where they equal q and v."""
         position, factors = self._of_positions
         velocity, rest = self._of_velocities, Reset(SOLUTION, 0, self._n + len(self._of_velocities.c))
         state = {f"{x}1": [s for s, name, _ in self._inputs if name == x] for x in "qv"}
@@ -104,7 +104,7 @@ class DifferentiableSystem:
         return DifferentiableProgram(LoopProgram([evaluation, rest]), parts, second)
 
     def _corrected(self, factors: SystemFactors, equation: SystemEquation, **names: str) -> list[KernelLoop | Reset]:
-        """Compute the solution, with its current value and the derivatives of two corrections."""
+        """Return the loops that compute the solution, with its current value and the derivatives of two corrections."""
         parts: list[KernelLoop | Reset] = [Reset(SOLUTION, 0, self._n + len(factors.gram.order))]
         for k in (1, 2):
             parts += [self._residual(equation, k, False, **names), self._solve(factors, equation, k, SOLUTION, ADD)]
@@ -121,7 +121,11 @@ class DifferentiableSystem:
         return KernelLoop(w.kernel(), ONCE)
 
     def _residual(self, equation: SystemEquation, k: int, only_rows: bool = False, **names: str) -> KernelLoop:
-        """Compute the residual of an equation; with `only_rows` only its right-hand side c, the residual of a zero solution."""
+        """Return the loop that computes the residual of an equation at the solution `x0`, in the array of the correction k.
+
+        With `only_rows` this is the right-hand side c alone, the residual r_x of a zero solution. `names` are arrays that replace
+        others, such as q="q1".
+        """
         w = KernelWriter(self._graph)
         for s, name, place in self._inputs:
             w.bind(s, names.get(name, name), None, place)
@@ -138,7 +142,11 @@ class DifferentiableSystem:
     def _solve(
         self, factors: SystemFactors, equation: SystemEquation, k: int, to: str, update: str, only_rows: bool = False
     ) -> KernelLoop:
-        """Solve for the change that removes a residual; add it to the solution, or write accelerations or a corrected state."""
+        """Return the loop that computes the change (w, x) of a solution that removes the residual of the correction k.
+
+        With `only_rows` it writes the array `to` minus w in the array with the name `to` followed by 1. Otherwise, with
+        `update=ADD`, it adds the change to the array `to`, or else writes the changed w to it.
+        """
         w, n, count = KernelWriter(), self._n, equation.count
         zero, rows = w.graph.constant(0.0), len(factors.gram.order)
         stored = [
@@ -162,7 +170,7 @@ class DifferentiableSystem:
         return KernelLoop(w.kernel(), ONCE)
 
     def _copy(self, to: str, start: str | None) -> KernelLoop:
-        """Write the solution w, or `start` minus the solution."""
+        """Return the loop that writes the solution w, or the array `start` minus w, to the array `to`."""
         w = KernelWriter()
         for i in range(self._n):
             s = w.read(SOLUTION, None, i)

@@ -34,7 +34,7 @@ class NumberPlace(NamedTuple):
 
 
 def number_fields(system: Any) -> dict[str, NumberField]:
-    """Return the numbers of a system by name."""
+    """Return a record of each number of a system, by name."""
     fields = {}
     for name, places in _places_by_name(system).items():
         value = places[0].leaf
@@ -82,7 +82,7 @@ def _places_by_name(system: Any) -> dict[str, list[NumberPlace]]:
 
 
 def _is_same(one: NumberPlace, other: NumberPlace) -> bool:
-    """Return whether two leaves are one number: fields of one module, so of one class, and equal unless traced."""
+    """Return whether two leaves count as one number: owners of one class, equal shapes and, unless traced, equal values."""
     x, y = one.leaf, other.leaf
     if one.owner != other.owner or np.shape(x) != np.shape(y):
         return False
@@ -105,7 +105,7 @@ def _places(system: Any) -> Iterator[NumberPlace]:
 
 
 def _is_of_user(owner: Any) -> bool:
-    """Return whether an object is the user's, neither a bound method of it nor a function derived from a kinetic energy."""
+    """Return whether an object is a module of the user, neither a bound method nor a function made from a kinetic energy."""
     return isinstance(owner, eqx.Module) and not hasattr(owner, "__self__") and not type(owner).__module__.startswith("udkjax.")
 
 
@@ -115,7 +115,7 @@ def _name_of(path: list[Any]) -> str:
 
 
 def _advice(system: Any, name: str, known: list[str]) -> str:
-    """Return the cure for an unknown name; a field may be a Python number, which is a part of the program."""
+    """Return the end of the message about an unknown name, which tells a cure or the known names."""
     ends = [p[-1] for p, x in jax.tree_util.tree_flatten_with_path(system)[0] if isinstance(x, float) and p]
     if any(getattr(end, "name", None) == name for end in ends):
         return ": it is a Python number, and so a part of the program; make it an array, such as jnp.array(2.0)"

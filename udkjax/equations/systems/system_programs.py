@@ -24,7 +24,7 @@ LONG_MASS = 2  # beyond this multiple, those of the mass matrix alone are estima
 
 
 class SystemPrograms(SystemTerms):
-    """The programs of a system."""
+    """The programs of a user-defined system: each computes the outputs that it is asked for."""
 
     @cached_property
     def for_derivatives(self) -> "SystemPrograms":
@@ -38,7 +38,7 @@ class SystemPrograms(SystemTerms):
 
     @cached_property
     def excess(self) -> str:
-        """The reason why the programs are too long for machine code; empty if they are not."""
+        """The reason why the programs are too long for machine code, for messages; "" if they are not."""
         of_mass = mass_operations(self.functions.mass)
         if of_mass > LONG_MASS * MOST_OPERATIONS:  # writing them, only to count, would take seconds
             return f"the elimination of its mass matrix takes {of_mass:,} operations, more than {MOST_OPERATIONS:,}"
@@ -49,7 +49,7 @@ class SystemPrograms(SystemTerms):
 
     @cached_property
     def prologue(self) -> LoopProgram:
-        """Compute constants, which are the numbers."""
+        """The program that copies the numbers to the constants: they are the same."""
         w = KernelWriter()
         w.write(w.read("numbers", 0), "constants", 0)
         return LoopProgram([KernelLoop(w.kernel(), np.arange(self.number_count)[:, None])])
@@ -65,7 +65,7 @@ class SystemPrograms(SystemTerms):
         return LoopProgram([KernelLoop(w.kernel(), ONCE)])
 
     def _scalars(self, factors: SystemFactors) -> dict[str, Callable[[], Sequence[Scalar]]]:
-        """Return the scalars of each output, by the factors of a program."""
+        """Return, for each output by name, a function that returns its scalars, with the given factors of linear systems."""
         rows, graph, functions = self._rows, self._graph, self.functions
         q1 = cache(lambda: less(functions.q, factors.correct(self._psi, self.position_rows)))
         v1 = cache(lambda: self._corrected_velocity(factors))
@@ -96,7 +96,7 @@ class SystemPrograms(SystemTerms):
         }
 
     def _drift_of_rates(self, dq: Sequence[Scalar]) -> list[Scalar] | None:
-        """Return the change of Psi_dot and phi by dq, for which a projection changes the velocities; None without phi.
+        """Return the change of Psi_dot and phi by dq, which a projection takes into account in velocities; None without phi.
 
         A row such as lag v + q = u(t) makes an error of q one of v that is 1 / lag times as large. Rows of Psi alone make it one
         of the size of dv: their slopes change by a rate of the motion.
@@ -128,7 +128,7 @@ class SystemPrograms(SystemTerms):
 
     @cached_property
     def differentiable(self) -> DifferentiableSystem:
-        """The programs that are differentiated."""
+        """The programs of accelerations and projections with derivatives."""
         mass, rest = self.functions.mass, [self._graph.constant(0.0)] * self.coordinate_count
         equation = SystemEquation(mass, self.functions.force, self._A, self._c, self.row_count)
         position = SystemEquation(mass, rest, self._A, self._psi, self.position_rows)

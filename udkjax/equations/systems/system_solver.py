@@ -79,7 +79,7 @@ class SystemFactors:
     def tangent_part(
         self, change: Sequence[Scalar], count: int | None = None, drift: Sequence[Scalar] | None = None
     ) -> list[Scalar]:
-        """Return the change that is left after a projection of A w = -drift, where drift is zero unless it is given."""
+        """Return the vector w nearest to `change`, in the metric of M, for which A w = -drift; the default of drift is zero."""
         rates = self.rows.rates(self.rows.mass.transposed(change))
         if drift is not None:
             rates = [rate + s for rate, s in zip(rates, drift, strict=True)]
@@ -87,12 +87,12 @@ class SystemFactors:
 
     @property
     def numbers(self) -> list[Scalar]:
-        """All numbers that solutions use."""
+        """All scalars of the factors that solutions use, in a fixed order."""
         parts = [self.rows.couplings, self.rows.compliance, [s for row in self.rows.B for s in row.values()]]
         return [s for part in (*parts, [s for c in self.gram.below for s in c.values()], self.gram.inverse) for s in part]
 
     def with_numbers(self, stored: Sequence[Scalar]) -> "SystemFactors":
-        """Return the factors with other scalars instead of `numbers`."""
+        """Return factors of the same structure, with the scalars `stored` in place of `numbers`."""
         values = iter(stored)
         below = [{i: next(values) for i in column} for column in self.rows.mass.below]
         mass = self.rows.mass._replace(below=below, inverse=[next(values) for _ in self.rows.compliance])
@@ -103,7 +103,7 @@ class SystemFactors:
 
 
 def factorize_mass(graph: Graph, mass: Sequence[SparseRow], A: Sequence[SparseRow]) -> MassFactors:
-    """Factorize M, and compute B. A mass matrix that is not positive definite makes the factors NaN."""
+    """Return the factors of M, and B. A mass matrix that is not positive definite makes the factors NaN."""
 
     def invert(_: int, pivot: Scalar, diagonal: Scalar) -> Scalar:
         nan = graph.constant(np.nan)
@@ -149,7 +149,7 @@ class PivotRule:
 
 
 def factorize_rows(graph: Graph, rows: MassFactors, split: int, rule: PivotRule) -> SystemFactors:
-    """Eliminate B C B^T: first the rows before `split`, then the others, each in an order of least fill."""
+    """Return the factors of B C B^T, in which the rows before `split` come first; both parts are in an order of least fill."""
     columns = [set(row) for row in rows.B]
     order = [*minimum_degree(columns[:split]), *(split + k for k in minimum_degree(columns[split:]))]
     gram: list[SparseRow] = []

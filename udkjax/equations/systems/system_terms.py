@@ -16,7 +16,7 @@ from udkjax.pinv.rank_policy import RankPolicy
 
 
 class SystemTerms(RunPrograms):
-    """The common terms of all programs of a system."""
+    """Base of the programs of a system: their inputs, and the scalars of terms and factors that they share."""
 
     is_small, has_loops = True, False
     piece_count = 0
@@ -49,7 +49,7 @@ class SystemTerms(RunPrograms):
 
     @property
     def row_names(self) -> list[tuple[str, int]]:
-        """The function that each row belongs to, and its index in it."""
+        """For each row, the name of its function, and its index among the rows of this function."""
         names = ("constraint", "velocity_constraint")
         return [(name, k) for name, count in zip(names, self.functions.row_counts, strict=True) for k in range(count)]
 
@@ -63,7 +63,7 @@ class SystemTerms(RunPrograms):
 
     @property
     def psi_q_entries(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """The entries of B: their rows, columns, indices in the array `psi_q`, and factors."""
+        """The entries of B: their rows, columns, indices in the array `psi_q`, and the factors of the numbers there, all one."""
         entries = np.array([(i, k) for i, row in enumerate(self._rows.B) for k in row], int).reshape(-1, 2)
         return entries[:, 0], entries[:, 1], np.arange(len(entries)), np.ones(len(entries))
 
@@ -74,12 +74,12 @@ class SystemTerms(RunPrograms):
 
     @cached_property
     def spread(self) -> LoopProgram:
-        """Replace the array `change`, u, by L^(-T) u, with the array `couplings`."""
+        """The program that replaces the array `change`, u, by L^(-T) u, with the entries of L in the array `couplings`."""
         return self._of_couplings(lambda mass, u: mass.backward(u))
 
     @cached_property
     def gather(self) -> LoopProgram:
-        """Replace the array `change`, w, by L^T w, with the array `couplings`."""
+        """The program that replaces the array `change`, w, by L^T w, with the entries of L in the array `couplings`."""
         return self._of_couplings(lambda mass, u: mass.transposed(u))
 
     def _of_couplings(self, function: Callable[[SparseLDL, Sequence[Scalar]], list[Scalar]]) -> LoopProgram:
@@ -122,7 +122,7 @@ class SystemTerms(RunPrograms):
 
     @property
     def _rate(self) -> list[Scalar]:
-        """Psi_dot and phi: what corrections of velocities remove."""
+        """Psi_dot followed by phi, the residuals that corrections of velocities remove."""
         return [*self.functions.psi_dot, *self.functions.phi]
 
     @cached_property

@@ -95,12 +95,12 @@ class SystemFunctions:
         return "\n".join(parts)
 
     def has(self, name: str) -> bool:
-        """Return whether the system has a function."""
+        """Return whether the system has the function `name`, one of `FUNCTIONS`."""
         return name in self._functions
 
     @property
     def other_terms(self) -> dict[str, list[Scalar]]:
-        """The terms of all functions but the loads, by the names of the functions."""
+        """The scalars of all terms except the load F, by the name of the function from which they come."""
         rows = {"mass": self.mass, "constraint": self.psi_q, "velocity_constraint": self.phi_v}
         further = {"mass": [], "constraint": [*self.psi, *self.psi_dot, *self.gamma], "velocity_constraint": self.phi + self.bend}
         return {name: [*further[name], *(s for row in parts for s in row.values())] for name, parts in rows.items()}
@@ -112,11 +112,14 @@ class SystemFunctions:
 
     @staticmethod
     def moving(breaks: bool) -> tuple[str, ...]:
-        """Return the groups of inputs that change along a motion; with breakpoints in time nothing else happens at a time."""
+        """Return the groups of inputs that change along a motion.
+
+        With `breaks`, breakpoints list all times at which functions are not smooth, so that time is left out.
+        """
         return ("position", "velocity") if breaks else ("position", "velocity", "time")
 
     def with_force(self, force: Callable[..., Array], count: int) -> "SystemFunctions":
-        """Return the functions with `force(numbers, t, q, v)` as all loads, where `count` further numbers are the last array."""
+        """Return the functions with `force(numbers, t, q, v)` as the whole load; `count` further numbers are the last array."""
         known = [np.array([s.constant is None for s in x.flat], dtype).reshape(shape) for x, (shape, dtype) in self._arrays]
         known.append(np.ones(count))
         structs = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in known]
@@ -132,13 +135,13 @@ class SystemFunctions:
         return list(zip(self.numbers, self.shapes, strict=True))
 
     def call(self, name: str, numbers: Sequence[Any], *arguments: Any) -> Array:
-        """Return the value of a function on arrays."""
+        """Return the value of the function `name` for arrays of numbers and for its arguments, such as t and q."""
         closed, constants, leaves = self._functions[name]
         program = closed.replace(consts=[x if k is None else numbers[k] for k, x in constants])
         return jax.extend.core.jaxpr_as_fun(program)(*(numbers[k] for k in leaves), *arguments)[0]
 
     def _inputs(self, k: int, x: Any, fixed: bool) -> np.ndarray:
-        """Return the scalars of an array; zeros of an array that cannot change otherwise are zeros by structure."""
+        """Return the scalars of the array x of numbers, number k; if it is `fixed`, its zeros are zeros by structure."""
         scalars, values = np.empty(np.shape(x), object), np.asarray(x) if fixed else None
         for index in np.ndindex(*np.shape(x)):
             zero = values is not None and values[index] == 0
@@ -146,7 +149,7 @@ class SystemFunctions:
         return scalars
 
     def _read(self, function: Callable, *arguments: str, **given: Any) -> list[np.ndarray]:
-        """Read a function of the numbers and of t, q, v, dt and dq into the graph."""
+        """Return the results of a function of the numbers and of t, q, v, dt or dq, as scalars of the graph."""
         structs = [jax.ShapeDtypeStruct(*x) for x in self.shapes]
         state = {"t": self.t, "q": self.q, "v": self.v, **given}
         scalars = [np.asarray(state[x], object) for x in arguments]
@@ -188,7 +191,7 @@ class SystemFunctions:
             self.phi, self.phi_v, self.bend = list(value.flat), self._rows(change, dq), [-s for s in bend.flat]
 
     def _rows(self, change: np.ndarray, dq: list[Scalar]) -> list[SparseRow]:
-        """Return the coefficients of changes that are linear in dq, by rows."""
+        """Return the coefficients by which changes are linear in dq, one sparse row for each change."""
         column = {s.index: i for i, s in enumerate(dq)}
         differential = Differential(self.graph, change.flat, dq)
         rows = [{column[k]: s for k, s in differential.row(x).items() if k in column} for x in change.flat]
@@ -196,9 +199,9 @@ class SystemFunctions:
 
 
 class TracedSystem(RunModel):
-    """A `ConstrainedSystem` of traced functions: `numbers` are the leaves on which all of them depend.
+    """A `ConstrainedSystem` whose functions are traced: `numbers` are the leaves on which all functions depend.
 
-    It has what runs ask of a mechanism: no number of it is sampled, so it is the same at any time.
+    As a `RunModel` it answers the questions of runs. None of its numbers is sampled over time.
     """
 
     numbers: list[Array]
@@ -230,7 +233,7 @@ class TracedSystem(RunModel):
         return partial(self.functions.call, name, self.numbers) if self.functions.has(name) else None
 
     def with_functions(self, functions: SystemFunctions, more: Array) -> "TracedSystem":
-        """Return the system with functions of its numbers and of one further array."""
+        """Return the system with other functions, which depend on its numbers and on the further array `more`."""
         return TracedSystem([*self.numbers, more], functions, self.row_labels, self.breakpoints)
 
     @property
@@ -249,7 +252,7 @@ class TracedSystem(RunModel):
 
 @cached_by_identity
 def trace_system(system: Any, n: int) -> TracedSystem:
-    """Trace the functions of a `ConstrainedSystem` of n coordinates.
+    """Return a `ConstrainedSystem` of n coordinates with traced functions; the result is cached.
 
     Raises:
         ArgumentError: a function returns an array of another shape than `ConstrainedSystem` says.
@@ -287,14 +290,14 @@ def trace_system(system: Any, n: int) -> TracedSystem:
 
 
 def joined_rows(value: Any) -> Any:
-    """Return the rows of a constraint as one vector, if they are given by name."""
+    """Return the rows of a constraint as one vector if they are given by name, else unchanged."""
     if not isinstance(value, Mapping):
         return value
     return jnp.concatenate([jnp.ravel(jnp.asarray(x, float)) for x in value.values()])
 
 
 def labels_of_rows(name: str, value: Any) -> list[str]:
-    """Return the labels of the rows of a constraint: their names, or its own with an index."""
+    """Return the labels of the rows of a constraint: the names of rows or, without these, its own name with an index."""
     if not isinstance(value, Mapping):
         return [f"{name}[{k}]" for k in range(np.size(value))]
     parts = [(label, np.size(x)) for label, x in value.items()]
@@ -302,7 +305,7 @@ def labels_of_rows(name: str, value: Any) -> list[str]:
 
 
 def _checked(name: str, value: Array, n: int) -> Array:
-    """Return the value of a function in the shape that it must have."""
+    """Return the value of the function `name`, with a single row as a vector; raise `ArgumentError` for a wrong shape."""
     if name in ("constraint", "velocity_constraint"):
         value = jnp.atleast_1d(value)
     wanted = {"mass": (n, n), "force": (n,), "potential": ()}.get(name)

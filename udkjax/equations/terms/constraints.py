@@ -84,7 +84,7 @@ def psi_dot(mechanism: Mechanism, t: NumberLike, q: BodyArray, v: BodyArray) -> 
 
 
 def rolling_rates(mechanism: Mechanism, t: NumberLike, q: BodyArray, v: BodyArray) -> Float[Array, "m"]:
-    """Return A v of the rows of rolling joints, which take the place of Psi_q v, and zero for all others.
+    """Return the rates A v of the rows of rolling joints, with A the coefficients of the velocities, and zero for all other rows.
 
     Args:
         mechanism: The scene.
@@ -108,7 +108,7 @@ def rolling_rates(mechanism: Mechanism, t: NumberLike, q: BodyArray, v: BodyArra
 
 
 def rolling_rows(mechanism: Mechanism) -> Bool[np.ndarray, "m"]:
-    """Return which rows restrict velocities alone: those of rolling joints."""
+    """Return a mask of the rows that restrict velocities alone, those of rolling joints; an empty array if there are none."""
     if not any(isinstance(joint, RollingJoint) for joint in mechanism.joints.values()):
         return np.zeros(0, bool)
     return np.array([isinstance(mechanism.constraints[name], RollingJoint) for name, _ in row_names(mechanism)], bool)
@@ -133,7 +133,7 @@ def gamma(mechanism: Mechanism, t: NumberLike, q: BodyArray, v: BodyArray) -> Fl
 
 
 def row_names(mechanism: Mechanism) -> list[tuple[str, int]]:
-    """Return the constraint that each row of Psi belongs to, and the row's index within it."""
+    """Return, for each row of Psi, the name of its constraint and its index among the rows of this constraint."""
     names, constraints = list(mechanism.constraints), [*mechanism.constraints.values()]
     residual = lambda c, *frames: vector(c.residual(0.0, *frames))  # noqa: E731
     rows = jax.eval_shape(lambda: [rows for _, rows in evaluate_by_kind(residual, mechanism, constraints, bodies(mechanism.q0))])
@@ -144,7 +144,7 @@ def row_names(mechanism: Mechanism) -> list[tuple[str, int]]:
 
 
 def _in_order(kinds: Sequence[tuple[ElementKind, Array]]) -> Float[Array, "m"]:
-    """Return rows of constraints sorted by kind in the order of their constraints."""
+    """Return the rows that were evaluated kind by kind as one vector, in the order of their constraints."""
     rows = jnp.concatenate([jnp.ravel(rows) for _, rows in kinds])
     owner = np.concatenate([np.repeat(kind.members, rows.shape[1]) for kind, rows in kinds])
     return entries(rows, np.argsort(owner, kind="stable")) if len(owner) else rows

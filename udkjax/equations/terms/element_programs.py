@@ -1,4 +1,4 @@
-"""Programs over scalars: one for all elements of the same structure, which loops run for each element (scene_programs.py)."""
+"""Programs over scalars, shared by all elements of the same structure: loops run them for each element (scene_programs.py)."""
 
 from collections.abc import Sequence
 from functools import lru_cache
@@ -24,7 +24,7 @@ FREE_INPUTS = ("fx", "fy", "fangle")  # components of a_F
 
 
 class ElementPrograms:
-    """The programs of elements of one structure: named lists of scalar outputs."""
+    """The expressions that all elements of one structure compute: lists of scalars of one graph, `outputs`, by name."""
 
     def __init__(self, structure: ElementStructure):
         self.structure = structure
@@ -48,11 +48,15 @@ class ElementPrograms:
 
     @property
     def element(self) -> Element:
-        """The element, with scalars for its numbers."""
+        """An element of this structure, with scalars of the graph in place of its numbers."""
         return jax.tree.unflatten(self.structure.tree, self.leaves)
 
     def _find_constants(self):
-        """Find the sines and cosines of the bodies' angles, and the constants, which depend only on parameters."""
+        """Set `constants`, the expressions that depend on parameters alone and that the outputs use.
+
+        The sines and cosines of the bodies' angles become inputs, in `state`. Elements that are piecewise smooth also get the
+        output "piece".
+        """
         if has_pieces(self.element):
             self.outputs["piece"] = [trace_piece(self.graph, self.structure, self.leaves, self.t, self.q, self.v)]
         angles = {s.index: body for name, body, s in self.state if name == "angle"}
@@ -69,7 +73,10 @@ class ElementPrograms:
 
 
 class ConstraintPrograms(ElementPrograms):
-    """Outputs by rows: `psi_q`, 3 columns for each body; `psi`, `psi_dot`, `gamma`, `b`."""
+    """The expressions of a constraint.
+
+    Outputs: `psi`, `psi_dot`, `gamma` and `b`, one scalar for each row, and `psi_q`, row by row, with 3 columns for each body.
+    """
 
     def __init__(self, structure: ElementStructure, baumgarte: bool, loaded: bool):
         super().__init__(structure)
@@ -93,7 +100,7 @@ class ConstraintPrograms(ElementPrograms):
 
 
 class ForcePrograms(ElementPrograms):
-    """Outputs: `loads`, 3 for each body, and `potential`."""
+    """The expressions of a force element. Outputs: `loads`, 3 for each body, and `potential`, a single scalar."""
 
     def __init__(self, structure: ElementStructure):
         super().__init__(structure)
@@ -106,8 +113,8 @@ class RubbingPrograms(ElementPrograms):
     """The friction of a joint that depends on its load, with x = -lambda of its eliminated rows among the inputs.
 
     Outputs: `loads`, 3 for each body, and `slopes`, their derivatives by each x, row by row. The loads are homogeneous in x, of
-    degree one: they are the sum of x times the slopes. Where one of the `edges`, loads whose magnitudes count, passes through
-    zero, the friction has a kink.
+    degree one: they are the sum of x times the slopes. `edges` are the loads of a slot, or of both edges of a guide, whose
+    magnitudes determine the friction: where one of them passes through zero, the friction has a kink.
     """
 
     def __init__(self, structure: ElementStructure, row_count: int, rows: tuple[int, ...]):

@@ -37,7 +37,10 @@ def as_scalar(array: NumericArray) -> Scalar:
 
 
 def _frames(ground: tuple[bool, ...], q: Sequence[Array], v: Sequence[Array] | None = None) -> list[Frame]:
-    """Make the frames of an element; all elements share the expressions of the sine and cosine of a body."""
+    """Return the frames of an element from the coordinates q of its bodies, and their velocities v unless v is None.
+
+    `ground` marks the frames that are the ground. The sine and cosine of each angle are computed here, once for the element.
+    """
     frames, k = [], 0
     for fixed in ground:
         if fixed:
@@ -90,7 +93,10 @@ def gamma_by_entries(graph: Graph, rows: list[SparseRow], q: list[Scalar], v: li
 
 
 def choose_shorter(graph: Graph, rows: list[SparseRow], first: list[Scalar], second: list[Scalar] | None) -> list[Scalar]:
-    """Return whichever of two equal lists of expressions needs fewer operations once the entries of the rows are computed."""
+    """Return the one of two equal lists of expressions that needs fewer operations once the entries of the rows are computed.
+
+    If `second` is None, the result is `first`.
+    """
     if second is None:
         return first
     entries = [entry for row in rows for entry in row.values()]
@@ -116,7 +122,7 @@ def trace_rubbing(
     v: list[Scalar],
     multipliers: list[Scalar],
 ) -> tuple[list[Scalar], list[list[Scalar]]]:
-    """Return the generalized loads of a `RubbingJoint` over the columns of q, and their derivative by each multiplier."""
+    """Return the generalized loads of a `RubbingJoint` over the columns of q, and their derivatives by each multiplier."""
     program = _trace_rubbing(*kind, len(multipliers))
     one, zero = graph.constant(1.0), graph.constant(0.0)
 
@@ -158,7 +164,7 @@ class TracedLoads:
         graph: the graph.
         inputs: the numbers of the element, t, q and v of its bodies; groups "number", "time", "q" and "v".
         velocities: v.
-        loads: the generalized loads, with those of its potential.
+        loads: the generalized loads, including those of the potential.
     """
 
     def __init__(self, kind: ElementStructure):
@@ -184,7 +190,7 @@ def traced_loads(element: ForceElement, frames: Sequence[str]) -> TracedLoads:
 
 
 def trace_edge_loads(graph: Graph, kind: ElementStructure, leaves: list[np.ndarray], multipliers: list[Scalar]) -> list[Scalar]:
-    """Return the loads of a `RubbingJoint` whose magnitudes its friction depends on."""
+    """Return the loads of a `RubbingJoint` whose magnitudes determine its friction (`Friction.edge_loads`), if any."""
     found = _trace_edge_loads(kind.tree, kind.shapes, len(multipliers))
     return [] if found is None else [as_scalar(s) for s in found(graph, leaves, [np.asarray(s, object) for s in multipliers])[0]]
 
@@ -236,14 +242,14 @@ def _residual(element: Constraint, ground: tuple[bool, ...], t: Array, q: Sequen
 
 
 def _as_rows(rows: Any) -> Array:
-    """Return the rows of a joint as one vector."""
+    """Return the rows of a joint, given as a list of numbers, an array or a number, as one vector."""
     rows = rows if isinstance(rows, list | tuple) else list(jnp.atleast_1d(jnp.asarray(rows)))
     return jnp.stack([jnp.asarray(r, jnp.result_type(float)) for r in rows])
 
 
 @lru_cache(maxsize=256)
 def _trace_residual(tree: TreeDef, shapes: LeafShapes, ground: tuple[bool, ...]) -> tuple[TraceFunction, TraceFunction]:
-    """Trace a residual's first and second derivative along (dt, dq)."""
+    """Trace functions of (t, q, dt, dq): a residual with its derivative along (dt, dq), and its second derivative along it."""
     n = 3 * (len(ground) - sum(ground))
     leaves = [jax.ShapeDtypeStruct(*s) for s in shapes]
     number = jax.ShapeDtypeStruct((), jnp.result_type(float))

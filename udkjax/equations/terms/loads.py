@@ -89,7 +89,7 @@ def potential_energy(mechanism: Mechanism, t: NumberLike, q: BodyArray, v: BodyA
 
 @traced_once
 def element_loads(mechanism: Mechanism, t: NumberLike, q: BodyArray, v: BodyArray) -> Float[Array, "n"]:
-    """Return the sum of the loads that the method `loads` of force elements returns, without those of potentials."""
+    """Return the sum of the loads that the methods `loads` of all force elements return; loads of potentials are not included."""
 
     time = jnp.asarray(t, jnp.result_type(float))
 

@@ -1,4 +1,4 @@
-"""Measures of the motion of a driven mechanism, such as torques, as expressions, with derivatives by adjoint equations.
+"""Measures of the motion of a driven mechanism, such as torques, as expressions with derivatives by adjoint equations.
 
 With s the value of the driver, differentiating Psi(x, s, q) = 0 gives
 
@@ -40,7 +40,7 @@ class MotionModel(NamedTuple):
 
 
 class MotionMeasures:
-    """The measures of a model in a graph: their `values`, and their derivatives with respect to s and x, `slopes()`.
+    """The measures of a `MotionModel` as scalars of a graph: their `values`, and `slopes()`, their derivatives by s and x.
 
     Everything is first written in a separate graph, with x, s, q, u, w, y and the multipliers as inputs, and differentiated with
     respect to each; then the expressions of these inputs are substituted.

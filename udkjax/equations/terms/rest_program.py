@@ -42,23 +42,23 @@ class RestProgram(NamedTuple):
     places: dict[str, EntryPlaces]  # of the entries in each array
 
     def of(self, *outputs: str) -> LoopProgram:
-        """Return the program that computes some arrays."""
+        """Return the program that computes the arrays `outputs`: `curvature` if this is the only one, else `loads`."""
         return self.curvature if outputs == (CURVATURE,) else self.loads
 
     @property
     def sizes(self) -> dict[str, int]:
-        """The sizes of the arrays."""
+        """The number of entries of each array that elements write, by name."""
         return {name: len(place.rows) for name, place in self.places.items()}
 
 
 class _Entries:
-    """The places of an array that grows by the entries of each element."""
+    """The places of the entries of an array, collected from the elements that write them."""
 
     def __init__(self):
         self._rows, self._columns, self.size = [np.zeros(0, int)], [np.zeros(0, int)], 0
 
     def add(self, group: ElementGroup, places: Sequence[tuple[int, int]]) -> np.ndarray:
-        """Add entries at (row, column) of each element's own block; return where each element's entries begin."""
+        """Add entries at (row, column) of each element's own block; return the index of each element's first entry."""
         start = self.size + len(places) * np.arange(len(group.table))
         coordinates = [group.table[:, BODIES + 3 * (k // 3) + BODY_COORDINATES] + k % 3 for k in range(group.coordinates)]
         for target, k in ((self._rows, 0), (self._columns, 1)):
@@ -143,7 +143,7 @@ def _write_reduction(terms: SceneTerms, places: dict[str, EntryPlaces]) -> Progr
 
 
 def _derivatives(outputs: Sequence[Scalar], variables: Iterable[Scalar]) -> dict[tuple[int, int], Scalar]:
-    """Return the derivatives that are not zero, by the indices of output and variable."""
+    """Return the nonzero derivatives of outputs with respect to variables, by the indices (output, variable)."""
     graph, found = outputs[0].graph, {}
     for k, variable in enumerate(variables):
         for i, s in enumerate(tangents(graph, outputs, {variable: graph.constant(1.0)})):

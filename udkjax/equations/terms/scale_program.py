@@ -45,7 +45,10 @@ def write_scales(terms: SceneTerms, places: Mechanism, number_count: int, prolog
         terms: The terms of the scene.
         places: The scene, with each number replaced by its index in `numbers`.
         number_count: Number of numbers of the scene.
-        prologue: The program of the constants.
+        prologue: The program that computes the constants of the scene.
+
+    Returns:
+        The program, and the sizes of its own arrays.
     """
     layout, bodies = terms.layout, list(places.bodies.values())
     masses = np.array([[int(body.mass), int(body.inertia)] for body in bodies])
@@ -81,7 +84,7 @@ def write_scales(terms: SceneTerms, places: Mechanism, number_count: int, prolog
 
 
 def _row_body_pairs(group: ConstraintGroup) -> list[tuple[int, int]]:
-    """Return the pairs of a row and a body of an element with nonzero entries in Psi_q."""
+    """Return the pairs (row, body) of an element for which Psi_q has entries that are not zero by structure."""
     entries = _entries(group)
     return [(r, b) for r, b in np.ndindex(entries.shape[:2]) if not all(s.is_zero for s in entries[r, b])]
 
@@ -92,7 +95,10 @@ def _entries(group: ConstraintGroup) -> np.ndarray:
 
 
 def _over_elements(terms: SceneTerms, group: ConstraintGroup, row_bodies: list[tuple[int, int]], first: np.ndarray) -> KernelLoop:
-    """Compute `moved` and `turned` of the pairs, and psi_t and gamma of the rows; `first` is each element's first pair."""
+    """Return the loop that computes `moved` and `turned` of the pairs, and psi_t and gamma of the rows.
+
+    `first` is the index of each element's first pair in the table of pairs.
+    """
     programs, base = group.programs, group.table.shape[1]
 
     def write(w: KernelWriter):
@@ -125,7 +131,7 @@ def _psi_t(group: ConstraintGroup) -> list[Scalar]:
 
 @lru_cache(maxsize=64)
 def _kernel(write: Callable[[KernelWriter], None]) -> Kernel:
-    """Return a kernel that all scenes share."""
+    """Return the kernel that `write` writes; it is made once, and all scenes share it."""
     w = KernelWriter()
     write(w)
     return w.kernel()
@@ -141,19 +147,19 @@ def _finite(x: Scalar) -> Scalar:
 
 
 def _swing(acceleration: Scalar) -> Scalar:
-    """Return the rate of an acceleration over a length: half a period of a pendulum is pi sqrt(L / a)."""
+    """Return the rate (1/s) of an acceleration a in units of L: one over half the period of a pendulum, pi sqrt(L / a)."""
     return acceleration.graph.sqrt(absolute(_finite(acceleration))) / math.pi
 
 
 def _write_finite(w: KernelWriter) -> None:
-    """Set the mass to NaN if a number is not finite."""
+    """Write code that makes the mass NaN if a number of the scene is not finite."""
     w.write(
         where(_is_finite(w.read("numbers", 0)), w.graph.constant(0.0), w.graph.constant(math.nan)), "scales", None, MASS, MAXIMUM
     )
 
 
 def _write_guess(w: KernelWriter) -> None:
-    """Compute q and v, the largest radius of gyration, and the largest mass."""
+    """Write code that copies q and v of the initial guess, and finds the largest radius of gyration and the largest mass."""
     mass, inertia = w.read("numbers", 1), w.read("numbers", 2)
     w.write(w.graph.sqrt(inertia / mass), "largest", None, RADIUS, MAXIMUM)
     w.write(mass, "scales", None, MASS, MAXIMUM)
@@ -163,7 +169,7 @@ def _write_guess(w: KernelWriter) -> None:
 
 
 def _write_arm(w: KernelWriter) -> None:
-    """Compute the longest lever arm of all pairs; 0 without pairs."""
+    """Write code that finds the longest lever arm of all pairs of a row and a body; it stays 0 without pairs."""
     moved, turned = w.read("moved", PAIR), w.read("turned", PAIR)
     is_moved = greater(moved, w.read("largest", None, MOVED) * ROUNDING)
     arm = where(is_moved, turned / where(is_moved, moved, w.graph.constant(1.0)), w.graph.constant(0.0))
@@ -178,7 +184,7 @@ def _write_length(w: KernelWriter) -> None:
 
 
 def _write_change(w: KernelWriter) -> None:
-    """Compute the change of each row by a displacement of L or a turn of one radian."""
+    """Write code that finds the largest change of each row by a displacement of L or a turn of one radian of a body."""
     moved = w.read("moved", PAIR) * w.read("scales", None, LENGTH)
     w.write(maximum(moved, w.read("turned", PAIR)), "change", PAIR_ROW, 0, MAXIMUM)
 
@@ -188,7 +194,7 @@ def _write_largest_change(w: KernelWriter) -> None:
 
 
 def _write_row(w: KernelWriter) -> None:
-    """Compute the scale of each row, and the rates at which rows change."""
+    """Write code that computes the scale of each row, and the largest rate at which rows change."""
     change = _finite(w.read("change", 0))
     moves = greater(change, w.read("largest", None, CHANGE) * ROUNDING)
     scale = where(moves, change, w.read("scales", None, LENGTH))  # L if no body moves the row at the guess
@@ -198,7 +204,7 @@ def _write_row(w: KernelWriter) -> None:
 
 
 def _write_inverse_mass(w: KernelWriter) -> None:
-    """Compute the largest diagonal entry (1/kg) of the weighted D D^T that a single body contributes."""
+    """Write code that finds the largest contribution (1/kg) of a single body to a diagonal entry of the weighted D D^T."""
     moved, turned = w.read("moved", PAIR), w.read("turned", PAIR)
     weight = w.read("scales", None, LENGTH) / w.read("scales", PAIR_ROW, ROWS)
     entry = moved * moved / w.read("numbers", PAIR_MASS) + turned * turned / w.read("numbers", PAIR_INERTIA)
@@ -206,7 +212,7 @@ def _write_inverse_mass(w: KernelWriter) -> None:
 
 
 def _write_rate(w: KernelWriter, free: list[Scalar]) -> None:
-    """Compute the rates at which velocities and free accelerations move and turn bodies."""
+    """Write code that finds the largest rate at which velocities and free accelerations move and turn bodies."""
     length = w.read("scales", None, LENGTH)
     for k, unit in enumerate((length, length, w.graph.constant(1.0))):
         for rate in (absolute(_finite(w.read("v", BODY_COORDINATES, k) / unit)), _swing(free[k] / unit)):

@@ -61,7 +61,7 @@ def arrays_of_solve(solve: int) -> dict[str, str]:
 
 @dataclass(eq=False, frozen=True)
 class ElementGroup:
-    """Elements of one structure, with the table of their loops."""
+    """Elements of one structure, with the table of the loops over them."""
 
     programs: ElementPrograms
     members: np.ndarray  # (elements,) indices among the constraints or force elements
@@ -87,15 +87,18 @@ class ConstraintGroup(ElementGroup):
 
     @property
     def loaded_rows(self) -> tuple[int, ...]:
-        """The rows whose multipliers are loads of friction: the eliminated ones, then the redundant ones."""
+        """The rows whose multipliers determine the loads of friction: the eliminated rows, then the redundant ones."""
         return self.rows + self.shared_rows
 
     def column(self, from_end: int) -> int:
-        """Return the index of a column from its index from the end of the table."""
+        """Return the index of a column of the table from its negative index, which counts from the end."""
         return self.table.shape[1] + from_end
 
     def slope(self, w: KernelWriter, row: int, k: int, base: int = SLOPES) -> Scalar:
-        """Read the derivative of component k of the friction's loads by x of a row; `base` is the column of a table."""
+        """Return the derivative of component k of the friction's loads by x of a row, read from `slopes` or zero.
+
+        `base` is the column of the table with the start index of an element's slopes; negative: counted from the end.
+        """
         s = w.graph.constant(0.0)
         if self.rubbing is not None:
             s = self.rubbing.outputs["slopes"][self.loaded_rows.index(row) * self.coordinates + k]
@@ -105,11 +108,14 @@ class ConstraintGroup(ElementGroup):
         return value if s.sign > 0 else -value
 
     def slopes(self, w: KernelWriter, row: int) -> list[Scalar]:
-        """Read the derivatives of all components by x of a row."""
+        """Return the derivatives of all components of the friction's loads by x of a row."""
         return [self.slope(w, row, k) for k in range(self.coordinates)]
 
     def entry(self, w: KernelWriter, row: int, k: int, base: int = ENTRIES) -> Scalar:
-        """Read an entry of Psi_q that the elements wrote; `base` is the column of a table."""
+        """Return the entry of Psi_q in a row and for coordinate k of an element: a constant, or read from `psi_q`.
+
+        Loops over the elements have written it there. `base` is the column of the table with the start index of their entries.
+        """
         s = self.programs.outputs["psi_q"][row * self.coordinates + k]
         if s.constant is not None:
             return w.graph.constant(s.constant)
@@ -117,7 +123,7 @@ class ConstraintGroup(ElementGroup):
         return value if s.sign > 0 else -value
 
     def entries(self, w: KernelWriter, row: int, base: int = ENTRIES) -> list[Scalar]:
-        """Read all entries of a row of Psi_q."""
+        """Return all entries of a row of Psi_q, as `entry` does."""
         return [self.entry(w, row, k, base) for k in range(self.coordinates)]
 
 
@@ -129,25 +135,31 @@ class ForceGroup(ElementGroup):
 
 
 class LoadShares(Enum):
-    """The shares of redundant rows in the loads of joints with friction (load_sharing.py) that programs compute.
+    """Ways in which programs treat redundant rows that share the loads of joints with friction (load_sharing.py).
 
-    `KNOWN` programs take weights of all rows among the numbers. `SWITCHED` ones leave out rows without weight, too. Programs with
-    `MARKED` rows take marks, which are negative for the redundant rows that share loads: other programs compute the shares.
+    `NONE`: no rows share loads. `KNOWN`: the redundant rows are known; the numbers of programs include weights of all rows, from
+    which programs compute the shares. `SWITCHED`: the same, but rows of weight zero are left out. `MARKED`: the redundant rows
+    are unknown; the numbers include marks, which are negative for redundant rows that share loads, and the programs that
+    `RunPrograms.with_shared_rows` returns compute the shares.
     """
 
     NONE, KNOWN, SWITCHED, MARKED = range(4)
 
     @property
     def weighs(self) -> bool:
-        """True if numbers are the weights of rows."""
+        """True if the numbers of programs include weights of the rows, in place of marks."""
         return self in (LoadShares.KNOWN, LoadShares.SWITCHED)
 
 
 class SceneLayout:
     """The groups of a scene's elements, and the sizes of all arrays, for one choice of eliminated rows.
 
-    If redundant rows share the loads of joints with friction (load_sharing.py), they are the `shared` rows, and numbers weigh all
-    rows.
+    Args:
+        mechanism: The scene; only its structure is used.
+        redundant_rows: Rows that are not eliminated; None: unknown, so that marks among the numbers select the rows.
+        baumgarte: Whether the gains of Baumgarte's stabilization are among the constants.
+        every_row: Whether redundant rows are eliminated as well.
+        sharing: Treatment of the loads of joints with friction. If it weighs rows, the redundant ones are the `shared` rows.
     """
 
     def __init__(
@@ -229,7 +241,7 @@ class SceneLayout:
         return constraint_programs(kind.structure, self.baumgarte, self._loaded)
 
     def _find_rows(self, redundant_rows: tuple[int, ...]) -> list[tuple[int, ...]]:
-        """Return the independent rows of each constraint."""
+        """Set the numbers and names of rows; return, for each constraint, the indices of its rows that are not redundant."""
         sizes = np.zeros(len(self._mechanism.constraints), int)
         for kind in self._kinds():
             sizes[kind.members] = self._programs(kind).row_count
@@ -307,7 +319,7 @@ class SceneLayout:
 
     @property
     def row_numbers(self) -> int:
-        """The number of rows whose multipliers are loads: the shared rows come first, then the eliminated ones."""
+        """The number of rows whose multipliers determine the loads of joints: the shared rows, then the eliminated ones."""
         return len(self.shared) + self._eliminated
 
     def place_of_row(self, row: int) -> tuple[ConstraintGroup, int, int]:
@@ -319,18 +331,18 @@ class SceneLayout:
         raise IndexError(row)
 
     def add_solves(self) -> None:
-        """Add the arrays of linear systems, after the number of eliminated rows is final."""
+        """Add the arrays of all linear systems of a program; called when the number of eliminated rows is final."""
         self.sizes["factors"] = self.sizes["gram"]
         for k in range(SOLVES):
             self.add_solve(k)
 
     def add_solve(self, k: int) -> None:
-        """Add the arrays of one linear system."""
+        """Add the arrays of the linear system with the number k."""
         self.sizes |= {f"{name}{k}": self.coordinate_count if name == "jt_x" else self._eliminated for name in SOLVE_ARRAYS}
 
     @cached_property
     def psi_q_entries(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """The entries of Psi_q: their rows, columns, indices in the array `psi_q`, and factors."""
+        """The entries of Psi_q: their rows, columns, indices in the array `psi_q`, and the factors of the numbers there."""
         blocks = [np.zeros((4, 0))]
         for group in self.constraints:
             for k, s in enumerate(group.programs.outputs["psi_q"]):

@@ -1,4 +1,4 @@
-"""The prologue of a scene: the constants that depend only on its numbers, computed once for each run."""
+"""The prologue of a scene: the program of all constants that depend only on its numbers, which runs once for each run."""
 
 from collections.abc import Sequence
 
@@ -77,7 +77,7 @@ def _group_constants(layout: SceneLayout, group: ElementGroup, elements: Sequenc
 def _constants(
     layout: SceneLayout, group: ElementGroup, programs: ElementPrograms | None, elements: Sequence[Element | None], to: int
 ) -> KernelLoop:
-    """Return the loop over the elements of a group that computes the constants of programs, from a column of the table on."""
+    """Return the loop that computes the constants of each element; column `to` of the table has their start indices."""
     assert programs is not None
     table = group.table
     members = [jax.tree.leaves(elements[i]) for i in group.members]

@@ -38,7 +38,11 @@ def dot(graph: Graph, a: list[Scalar], b: list[Scalar]) -> Scalar:
 
 
 class SceneTerms:
-    """Loops that read and write the arrays of a `SceneLayout`. Kernels are made once and shared."""
+    """Loops that read and write the arrays of a `SceneLayout`.
+
+    Arguments such as `v`, `q` or `sines` are names of arrays; `solve` and `solution` are numbers of linear systems. Kernels are
+    made once for each key and shared.
+    """
 
     def __init__(self, layout: SceneLayout, kernels: dict[Hashable, Kernel]):
         self.layout, self.kernels = layout, kernels
@@ -46,7 +50,7 @@ class SceneTerms:
     # --- kinds of loops
 
     def kernel(self, key: Hashable, write: Write, graph: Graph | None = None) -> Kernel:
-        """Return the kernel of this key, made by `write` on first use."""
+        """Return the kernel with this key; on first use it is made by `write`, in the graph `graph` or a new one."""
         if key not in self.kernels:
             writer = KernelWriter(graph)
             write(writer)
@@ -58,7 +62,10 @@ class SceneTerms:
         return KernelLoop(self.kernel(key, write), np.zeros((1, 1), int), names)
 
     def over_bodies(self, key: Hashable, write: Write, fixed: Collection[str] = (), **names: str) -> KernelLoop:
-        """Return a loop over all bodies; `names` map arrays of the kernel to arrays of the program whose names differ."""
+        """Return a loop over all bodies.
+
+        `names` map arrays of the kernel to arrays of the program with other names; `fixed` arrays are constant in derivatives.
+        """
         return KernelLoop(self.kernel(key, write), self.layout.body_table, names, fixed)
 
     def over_group(
@@ -68,9 +75,9 @@ class SceneTerms:
         return self.over_elements((key, group), group, group.programs, OWN_CONSTANTS, write, fixed, **names)
 
     def over_rubbing(self, key: Hashable, group: ConstraintGroup, write: Write, **names: str) -> KernelLoop:
-        """Return a loop over the joints of a group with friction, with the inputs of its programs bound to arrays.
+        """Return a loop over the joints of a group with friction, with the inputs of their friction bound to the scene's arrays.
 
-        x of their rows is read from the array `x`: that of a solution, or of loads if redundant rows share them.
+        The inputs x = -lambda of its rows are bound to the array `x`, for which `names` must give the result of `loads_of`.
         """
         rubbing, shared = group.rubbing, len(self.layout.shared)
         assert rubbing is not None
@@ -99,7 +106,7 @@ class SceneTerms:
     ) -> KernelLoop:
         """Return a loop over the elements of a group, with the inputs of `programs` bound to the arrays of the scene.
 
-        `constants` is the column of the start indices of their constants.
+        `constants` is the column of the table with the start indices of the constants of `programs`.
         """
 
         def bind_inputs(w: KernelWriter):
@@ -123,7 +130,7 @@ class SceneTerms:
     # --- terms of the equations
 
     def sincos(self, q: str = "q", sines: str = "sines") -> KernelLoop:
-        """Return the sine and the cosine of the angle of each body."""
+        """Return the loop that computes the sine and the cosine of each body's angle, from the array `q` to the array `sines`."""
 
         def write(w: KernelWriter):
             angle = np.asarray(w.read("q", BODY_COORDINATES, 2), object)
@@ -134,7 +141,7 @@ class SceneTerms:
         return self.over_bodies("sincos", write, q=q, sines=sines)
 
     def free_accelerations(self, v: str) -> ProgramParts:
-        """Compute a_F if there are force elements; without them it is gravity."""
+        """Yield loops that compute a_F in `free`, at the velocities `v`; none without force elements: a_F is then gravity."""
         if not self.layout.forces:
             return
         yield Reset("load", 0, self.layout.coordinate_count)
@@ -157,7 +164,7 @@ class SceneTerms:
         return w.read("constants", None, self.layout.gravity + k) if k < 2 else w.graph.constant(0.0)
 
     def read_free(self, w: KernelWriter, k: int) -> Scalar:
-        """Read component k of a_F of a body."""
+        """Return component k of a_F of a body, read from `free`, or gravity without force elements."""
         return w.read("free", BODY_COORDINATES, k) if self.layout.forces else self._gravity(w, k)
 
     def element_terms(
@@ -168,9 +175,15 @@ class SceneTerms:
         groups: Sequence[ConstraintGroup] | None = None,
         **names: str,
     ) -> ProgramParts:
-        """Compute Psi_q, if among `outputs`, and the other outputs as right-hand sides of the systems `solve`, `solve` + 1, ...
+        """Yield loops that compute outputs of `ConstraintPrograms` for all elements of some groups.
 
-        The default of `groups` is all groups with eliminated rows.
+        Args:
+            outputs: "psi_q" is written to the array of this name; each other output, in order and for the eliminated rows, to the
+                right-hand side of a linear system: the first to that of `solve`, the next to that of `solve` + 1.
+            v: Array of the velocities.
+            solve: Number of the first linear system.
+            groups: The groups; None: all groups with eliminated rows.
+            names: Arrays that replace others, such as q="q1".
         """
         rights = [name for name in outputs if name != "psi_q"]
         for group in self.layout.eliminated if groups is None else groups:
@@ -187,12 +200,12 @@ class SceneTerms:
             yield self.over_group(outputs, group, write, v=v, **named, **names)
 
     def every_entry(self) -> ProgramParts:
-        """Compute Psi_q of all rows, followed by a one, to which constant entries refer."""
+        """Yield loops that compute `psi_q` with the entries of all rows, and the one to which constant entries refer."""
         yield Reset("psi_q", self.layout.one, 1, 1.0)
         yield from self.element_terms(("psi_q",), groups=self.layout.constraints)
 
     def row_terms(self, name: str, array: str, start: int = 0, **names: str) -> ProgramParts:
-        """Write Psi, Psi_dot or b of all rows, in their order, to an array."""
+        """Yield loops that write Psi, Psi_dot or b (`name`) of all rows, in their order, to an array, from index `start` on."""
         for group in self.layout.constraints:
 
             def write(w: KernelWriter, group: ConstraintGroup = group):
@@ -202,7 +215,7 @@ class SceneTerms:
             yield self.over_group((name, start), group, write, to=array, **names)
 
     def energy(self) -> ProgramParts:
-        """Compute v^T M v / 2, and the potential energy of gravity and of the force elements."""
+        """Yield loops that compute `energy`: v^T M v / 2, and the potential energy of gravity and of the force elements."""
         yield Reset("energy", 0, 2)
 
         def write(w: KernelWriter):
@@ -223,7 +236,7 @@ class SceneTerms:
             yield self.over_group("potential", group, write_potential)
 
     def friction_power(self, solution: int) -> ProgramParts:
-        """Compute the power of all friction (W), with the loads of joints from the solution x of a linear system."""
+        """Yield loops that compute `friction_power` (W), the power of all friction, for the solution x of a linear system."""
         yield Reset("friction_power", 0, 1)
 
         def writer(programs: ElementPrograms) -> Write:
@@ -241,10 +254,10 @@ class SceneTerms:
             yield self.over_rubbing("power", group, writer(group.rubbing), x=self.loads_of(solution))
 
     def pieces(self) -> ProgramParts:
-        """Compute the index of the smooth piece of each piecewise smooth element, and the loads of edges.
+        """Yield loops that compute `pieces`: the index of the smooth piece of each piecewise smooth element, and loads of edges.
 
-        An edge has two pieces, by the sign of its load. Its load is given as the acceleration of the lighter body by it (m/s^2);
-        the loads of joints with friction have `settled` before.
+        An edge (`RubbingPrograms`) has two pieces, by the sign of its load. The load is written as the acceleration (m/s^2) that
+        it gives the lightest body of the joint. Loads are computed from x in the array `settled`.
         """
         for group, places in self.layout.pieces:
             base = group.table.shape[1]
@@ -272,9 +285,10 @@ class SceneTerms:
     # --- products with the eliminated rows of Psi_q and their transpose
 
     def rates(self, change: str, solve: int, subtract: bool = False, of_positions: bool = False) -> ProgramParts:
-        """Set the right-hand side of a linear system to Psi_q times a change of coordinates, or subtract the product from it.
+        """Yield loops that set the right-hand side of a linear system to Psi_q times the array `change`.
 
-        `of_positions`: rows that restrict velocities alone, whose Psi is zero, allow any change.
+        With `subtract` the product is subtracted from the right-hand side instead. With `of_positions` the product is zero in
+        rows that restrict velocities alone, whose Psi is zero: they allow any change of positions.
         """
         for group in self.layout.eliminated:
 
@@ -289,7 +303,7 @@ class SceneTerms:
             yield KernelLoop(self.kernel(("rates", group, subtract, of_positions), write), group.table, names)
 
     def jt(self, solve: int) -> ProgramParts:
-        """Compute jt_x = Psi_q^T x of a linear system."""
+        """Yield loops that compute jt_x = Psi_q^T x of the linear system `solve`."""
         names = arrays_of_solve(solve)
         yield Reset(names["jt_x"], 0, self.layout.coordinate_count)
         for group in self.layout.eliminated:
@@ -300,7 +314,7 @@ class SceneTerms:
             yield KernelLoop(self.kernel(("jt", group), write), group.table, names)
 
     def remainder(self, solve: int, target: int) -> ProgramParts:
-        """Compute right - Psi_q M^(-1) Psi_q^T x of the system `solve`, as the right-hand side of the system `target`."""
+        """Yield loops that set the right-hand side of `target` to right - Psi_q M^(-1) Psi_q^T x of the system `solve`."""
         for group in self.layout.eliminated:
 
             def write(w: KernelWriter, group: ConstraintGroup = group):
@@ -322,10 +336,10 @@ class SceneTerms:
         update: str = SET,
         fixed: Collection[str] = (),
     ) -> KernelLoop:
-        """Set `to` to start + sign * change for each body; the default of both is zero.
+        """Return the loop that sets the array `to`, for each body, to start + sign * change; without an argument each is zero.
 
-        `start` is the name of an array, or `free`. The change is the array `change`, or M^(-1) Psi_q^T y, with y the solution of
-        the linear system `solution`.
+        `start` is the name of an array, or "free" for a_F. The change is the array `change` or, for a linear system `solution`,
+        M^(-1) times its jt_x. With `update=ADD` the result is added to `to`. `fixed` arrays are constant in derivatives.
         """
         base, size = (SINE, 2) if start == "sines" else (BODY_COORDINATES, 3)
 
@@ -348,11 +362,14 @@ class SceneTerms:
         )
 
     def loads_of(self, solution: int) -> str:
-        """Return the array of the x of all rows that are loads of joints: the solution x, or its shares in all rows."""
+        """Return the name of the array of the x that determine the loads of joints, after the solution of a linear system.
+
+        It is the solution itself or, if redundant rows share the loads, "loads" with the number of the system.
+        """
         return f"loads{solution}" if self.layout.shared else f"x{solution}"
 
     def multipliers(self, solution: int) -> ProgramParts:
-        """Compute the multipliers lambda = -x of a linear system in the order of Psi, zero for rows that are left out."""
+        """Yield loops that compute `multipliers`, lambda = -x of a linear system, in the order of Psi; zero for rows left out."""
         yield Reset("multipliers", 0, self.layout.row_count)
         shared, names = len(self.layout.shared), {"x": self.loads_of(solution)}
         for group in self.layout.eliminated:
@@ -372,22 +389,22 @@ class SceneTerms:
 
 
 def read_bodies(w: KernelWriter, group: ElementGroup, array: str) -> list[Scalar]:
-    """Read the elements of an array of coordinates that belong to the bodies of an element."""
+    """Return the numbers of an array of coordinates that belong to the bodies of an element."""
     return [w.read(array, BODIES + 3 * (k // 3) + BODY_COORDINATES, k % 3) for k in range(group.coordinates)]
 
 
 def rows(group: ConstraintGroup) -> range:
-    """Return the indices of a group's eliminated rows."""
+    """Return the indices of the eliminated rows of each element of a group, from zero."""
     return range(len(group.rows))
 
 
 def compliance(w: KernelWriter, k: int, base: int = BODY_CONSTANTS) -> Scalar:
-    """Read the diagonal entry of M^(-1) for coordinate k of a body."""
+    """Return the diagonal entry of M^(-1) for coordinate k of a body; `base` is the table's column of the body's constants."""
     return w.read("constants", base, MASS_OR_INERTIA[k])
 
 
 def write_jt(w: KernelWriter, group: ConstraintGroup, entries: list[list[Scalar]], x: list[Scalar], to: str = "jt_x") -> None:
-    """Add Psi_q^T x of the eliminated rows of a group to an array of coordinates."""
+    """Write code that adds Psi_q^T x to the array `to` of coordinates, with the `entries` of the eliminated rows and their x."""
     for k in range(group.coordinates):
         total = dot(w.graph, [row[k] for row in entries], x)
         if not total.is_zero:

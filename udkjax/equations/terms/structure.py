@@ -30,7 +30,7 @@ Structure: TypeAlias = tuple[TreeDef, LeafShapes]
 
 
 class RubbingJoint(eqx.Module):
-    """A joint with the friction that depends on its load, both without names.
+    """A joint, and the friction of this joint that depends on its load; both without the names of bodies and joints.
 
     Args:
         bodies: the names of the bodies of the joint.
@@ -53,7 +53,7 @@ AnyElement = TypeVar("AnyElement", bound=eqx.Module)
 
 
 def structure(mechanism: Mechanism) -> Structure:
-    """Return the tree of a mechanism and the shape and dtype of each of its numbers; equal for any number of samples."""
+    """Return the tree of a mechanism, and the shape and dtype of each number. It does not depend on the number of samples."""
     return _structure_of_elements(mechanism.without_origin)
 
 
@@ -68,7 +68,10 @@ def _structure(mechanism: Mechanism) -> tuple[TreeDef, LeafShapes]:
 
 
 def whole_structure(mechanism: Mechanism) -> tuple[TreeDef, LeafShapes]:
-    """Return the structure of a mechanism with all of its samples, whose programs are functions of time throughout."""
+    """Return the structure of a mechanism with all of its samples and their knots.
+
+    Programs of this structure are given all samples at once; those of `structure` only the samples of one interval of time.
+    """
     return _whole_structure_of_elements(mechanism.without_origin)
 
 
@@ -86,7 +89,7 @@ def numbers_as_vector(numbers: Sequence[ArrayLike]) -> NumericArray:
 
 
 def join_concrete_numbers(numbers: Sequence[ArrayLike]) -> list[ArrayLike]:
-    """Join each run of successive concrete numbers and arrays into one NumPy vector."""
+    """Return a list in which each run of successive concrete numbers is one NumPy vector; traced numbers stay as they are."""
     joined = []
     for traced, group in groupby(numbers, lambda x: isinstance(x, Tracer)):
         if traced:
@@ -97,18 +100,21 @@ def join_concrete_numbers(numbers: Sequence[ArrayLike]) -> list[ArrayLike]:
 
 
 def concrete_numbers(mechanism: Mechanism, t: Time = 0.0) -> np.ndarray:
-    """Return the concrete numbers of a mechanism as one vector, which must not change; if sampled, those of time t (s)."""
+    """Return the concrete numbers of a mechanism as one vector, which callers must not change.
+
+    Sampled numbers are those of the interval that contains the time t (s).
+    """
     return whole_numbers(mechanism.at(t) if mechanism.samples else mechanism.without_origin)
 
 
 @cached_by_identity
 def whole_numbers(mechanism: Mechanism) -> np.ndarray:
-    """Return the concrete numbers of a mechanism with all of its samples as one vector, which must not change."""
+    """Return the concrete numbers of a mechanism, including all samples, as one vector, which callers must not change."""
     return np.concatenate([np.asarray(x, float).ravel() for x in mechanism.numbers])
 
 
 class ElementStructure(NamedTuple):
-    """An element without the names of its bodies and the values of its numbers: elements that share it are traced once."""
+    """An element without the names of its bodies and the values of its numbers: elements of equal structure are traced once."""
 
     tree: TreeDef
     shapes: LeafShapes
@@ -128,7 +134,7 @@ def element_structure(element: Element, frames: Sequence[str]) -> ElementStructu
 
 
 def nameless(element: AnyElement, frames: Sequence[str]) -> AnyElement:
-    """Return an element with the indices of its `frames` instead of names of bodies, and without names of joints."""
+    """Return an element whose bodies are named by their indices in `frames`, and whose references to joints are empty."""
     numbers = {name: GROUND if name == GROUND else str(k) for k, name in enumerate(frames)}
     renamed = object.__new__(type(element))
     for name, value in vars(element).items():
@@ -163,7 +169,7 @@ class ElementKind(NamedTuple):
 def element_kinds(
     mechanism: Mechanism, elements: Sequence[Element], labels: Sequence[Hashable] | None = None
 ) -> list[ElementKind]:
-    """Sort elements by structure and, if there are `labels`, by label."""
+    """Return the kinds of elements: those of equal structure and, if `labels` are given, one for each element, equal label."""
     body_index, joints = {name: k for k, name in enumerate(mechanism.body_names)}, mechanism.joints
     kinds: dict[tuple[ElementStructure, Hashable], list[tuple[int, list[int]]]] = {}
     for i, element in enumerate(elements):

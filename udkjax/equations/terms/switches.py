@@ -1,4 +1,4 @@
-"""Constraints that events switch on and off, and friction that goes with its joint.
+"""Constraints that events switch on and off, and friction that is switched together with its joint.
 
 A switched element has one more number, `active`: one, or zero, which makes its rows of Psi, or its loads, vanish. All sets of
 constraints that events can leave behind are thus one mechanism with different numbers, and share its equations and its code.
@@ -26,7 +26,7 @@ AnyConstraint = TypeVar("AnyConstraint", bound=Constraint)
 
 
 def switched(constraint: AnyConstraint) -> AnyConstraint:
-    """Return a constraint with the number `active`, switched on."""
+    """Return a constraint with the further number `active`, which is one: the constraint is switched on."""
     return make_module(_switched(type(constraint)), **vars(constraint), active=number(1.0))
 
 
@@ -61,7 +61,7 @@ def _switched(cls: type) -> Any:
 
 @cache
 def switched_friction(cls: type) -> Any:
-    """Return the subclass of a class of friction that is off without its joint."""
+    """Return the subclass of a class of friction with the number `active`, for a joint that can be switched."""
 
     class SwitchedFriction(cls):
         active: Float[Array, ""] = eqx.field(default=1.0)
@@ -84,7 +84,7 @@ def switched_friction(cls: type) -> Any:
 
 
 def with_switched_friction(forces: dict[str, Any], names: Sequence[str]) -> dict[str, Any]:
-    """Return force elements, with friction of the joints `names` switched on with them."""
+    """Return force elements by name, in which the friction of the joints `names` has the number `active`, set to one."""
     result = {}
     for name, force in forces.items():
         is_switched = isinstance(force, Friction) and force.joint in names
@@ -122,7 +122,7 @@ def with_switches(
 
 
 def switch(mechanism: Mechanism, names: Sequence[str], active: Sequence[Any]) -> Mechanism:
-    """Return the mechanism with other numbers `active` of its switched constraints, by name, and of their friction."""
+    """Return the mechanism with new numbers `active`, one for each of the switched constraints `names`, and for its friction."""
 
     def numbers(m: Mechanism) -> list[Any]:
         return [element.active for _, element in _switched_elements(m, names)]
