@@ -1,4 +1,4 @@
-"""Loops and branches of algorithms that are written once and run by NumPy where all numbers are concrete, else by JAX.
+"""Loops and branches of algorithms that are written once, and run by NumPy if all numbers are concrete, otherwise by JAX.
 
 JAX compiles for seconds before the first step; NumPy begins at once.
 """
@@ -99,9 +99,10 @@ BY_NUMPY = ControlFlow(np, _while_loop, _cond, _scan, _map, _vmap, _put, _call_c
 
 
 def solve(function: Callable[..., Result], *arguments: Any, put: bool = True) -> Result:
-    """Return function(*arguments, flow), by NumPy's control flow if all numbers are concrete, else by JAX's in one program.
+    """Return function(*arguments, flow), where `flow` is a `ControlFlow`.
 
-    NumPy's results are converted to JAX arrays, if `put`.
+    `flow` is `BY_NUMPY` if all numbers of the arguments are concrete; otherwise `BY_JAX`, and the call is one JAX program. If
+    `put`, results of NumPy are converted to JAX arrays.
     """
     leaves, tree = jax.tree.flatten(arguments, is_leaf=lambda x: _is_of_modules(type(x)))
     is_module = [_is_of_modules(type(x)) for x in leaves]
@@ -122,7 +123,10 @@ _is_traced_module = cached_by_identity(is_traced)
 
 
 class ConvertsItself:
-    """A base of modules whose functions convert numbers by themselves, and store what they compute by the module's identity."""
+    """A base class of Equinox modules that `solve` passes to a function unchanged, without converting their arrays to NumPy.
+
+    Their methods convert numbers themselves, and cache results by the identity of the module, which a conversion would change.
+    """
 
 
 def _by_numpy(x: Any, is_module: bool = False) -> Any:
@@ -133,7 +137,7 @@ def _by_numpy(x: Any, is_module: bool = False) -> Any:
 
 @cached_by_identity  # the same object for the same module, so that what is computed from it is found again
 def by_numpy_arrays(module: Module) -> Module:
-    """Return a module of concrete numbers with NumPy's arrays."""
+    """Return a module of concrete numbers with NumPy arrays in place of JAX arrays; cached by the identity of the module."""
     return jax.tree.map(_by_numpy, module)
 
 
@@ -144,7 +148,7 @@ def _by_jax(function: Callable[..., Result], *arguments: Any) -> Result:
 
 @jax.custom_batching.custom_vmap
 def _any_member(condition: Bool[Array, ""]) -> Bool[Array, ""]:
-    """Return the condition; in a batch, whether it holds for any member."""
+    """Return the condition; in a batch, True if it holds for any member."""
     return condition
 
 
@@ -155,9 +159,10 @@ def _(axis_size: int, batched: Any, condition: Bool[Array, "B"]) -> tuple[Bool[A
 
 
 def cond_of_batch(condition: Bool[Array, ""], function: Callable[[], Result], otherwise: Callable[[], Result]) -> Result:
-    """Return function() if the condition holds, else otherwise(), which takes little time.
+    """Return function() if the condition holds, else otherwise(), which should be cheap.
 
-    A batch computes the function where the condition holds for any member; for `jax.lax.cond` it always computes both.
+    A batch evaluates `function` only if the condition holds for at least one member. With `jax.lax.cond` alone, a batch would
+    always evaluate both.
     """
 
     def selected() -> Result:
@@ -167,9 +172,9 @@ def cond_of_batch(condition: Bool[Array, ""], function: Callable[[], Result], ot
 
 
 def sequential(function: Callable[..., Result], *arguments: PyTree) -> Result:
-    """Return function(*arguments), pytrees of arrays and static values, without derivatives; `vmap` maps one member at a time.
+    """Return function(*arguments) for pytrees of arrays and static values; under `vmap`, members are computed one after another.
 
-    In a batched loop all members would take as many steps as the slowest one.
+    If loops were batched, all members would take as many iterations as the slowest one. The result has no derivatives.
     """
     arrays, choices = eqx.partition(arguments, eqx.is_array)
 

@@ -44,9 +44,10 @@ _SPENT: "WeakKeyDictionary[Any, int]" = WeakKeyDictionary()  # operations evalua
 
 
 def deferred(function: Callable[Arguments, Result], keeps_concrete: bool = False) -> Callable[Arguments, Result]:
-    """Return a deferred version of a function of trees of arrays and static values, traced once per structure (`filter_jit`).
+    """Return a deferred version of a function: outside of compiled programs, NumPy evaluates it until compiling it pays off.
 
-    Outside of compiled programs, NumPy evaluates it, its derivatives and its batches at first.
+    The same holds for its derivatives and its batches. Arguments are trees of arrays and static values; the function is traced
+    once for each structure of these, as by `equinox.filter_jit`.
 
     Args:
         function: the function.
@@ -81,7 +82,16 @@ def deferred(function: Callable[Arguments, Result], keeps_concrete: bool = False
 def trace_once(
     function: Callable[..., Any], args: tuple[Any, ...], kwargs: dict[str, Any] | None = None
 ) -> "tuple[Any, list[Any], ResultForm]":
-    """Return the program of a function, traced once per structure of its arguments, their arrays, and the form of the result."""
+    """Trace a function once for each structure of its arguments; the program is cached.
+
+    Args:
+        function: the function, of trees of arrays and static values.
+        args: its arguments.
+        kwargs: its keyword arguments.
+
+    Returns:
+        The program as a closed jaxpr, the arrays of the arguments, which are its inputs, and the form of the function's result.
+    """
     given, tree = jax.tree.flatten((args, kwargs or {}))
     are_arrays = tuple([isinstance(x, _ARRAYS) for x in given])
     leaves = [x for x, is_array in zip(given, are_arrays, strict=True) if is_array]
@@ -130,14 +140,20 @@ def traced_once(function: Callable[Arguments, Result]) -> Callable[Arguments, Re
 
 
 def _as_traced(value: Any) -> Any:
-    """Return a mechanism without its origin, and numbers as arrays: neither affects the trace."""
+    """Return a mechanism without its origin (the file or drawing that it comes from), and any other value as an array.
+
+    Equal structures then share a trace.
+    """
     if isinstance(value, eqx.Module):
         return value.without_origin  # pyright: ignore[reportAttributeAccessIssue]
     return jnp.asarray(value, jnp.result_type(float))
 
 
 class ConcreteLeaf:
-    """A concrete number or any other object, compared by content, so that equal ones share traces."""
+    """A concrete number or any other object, compared by content, so that calls with equal ones share a trace.
+
+    Objects that cannot be hashed are compared by identity.
+    """
 
     def __init__(self, value: Any):
         self.value = value
@@ -172,17 +188,17 @@ def _is_array(x: Any) -> bool:
 
 
 class _ClosesOverError(Exception):
-    """A function among the arguments closes over traced numbers: its program cannot be reused."""
+    """An exception for a function that closes over traced numbers, itself or by its arguments: its program cannot be reused."""
 
 
 class ResultForm:
-    """The form of a result: the tree of its arrays, and its static part."""
+    """The form of a function's result: the structure of the tree of its arrays, and everything in it except arrays."""
 
     tree: Any
     static: Any
 
     def rebuild(self, arrays: Sequence[Any]) -> Any:
-        """Return the result with these arrays."""
+        """Return the result that has this form and these arrays."""
         return eqx.combine(jax.tree.unflatten(self.tree, arrays), self.static)
 
 
@@ -195,7 +211,10 @@ def _trace(
     types: tuple[Any, ...],
     x64: bool,
 ) -> tuple[Any, ResultForm]:
-    """Return the program of a function of the arrays among the leaves of a tree; the others are fixed."""
+    """Return the program of a function of the arrays among the leaves of a tree, and the form of its result.
+
+    The other leaves are `fixed`: their values are part of the program.
+    """
     del x64  # only part of the key of the cache
     out = ResultForm()
 

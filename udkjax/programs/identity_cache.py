@@ -1,10 +1,10 @@
-"""Caches of results computed from immutable objects, by their identities; and of programs, whose memory is bounded.
+"""Caches of results by the identities of the immutable objects they are computed from; and of programs, whose memory is bounded.
 
 Mechanisms, states and methods are trees of arrays: comparing their values takes as long as many of the computations.
 
 Programs and machine code take megabytes. The results of all functions that are `cached_by_size` share `MOST_BYTES`. If they take
-more, the least recently used ones are dropped, whatever function they are of: those of one structure were used together, and are
-dropped together. The latest result always stays.
+more, the least recently used results of any of these functions are dropped: results for one structure were used together, and
+are dropped together. The latest result always stays.
 """
 
 import weakref
@@ -33,12 +33,12 @@ _BY_VALUE = (bool, int, float, str, np.generic, type(None))  # isinstance of an 
 
 
 class CachedFunction(Protocol[Arguments, Produced_co]):
-    """A function with a cache."""
+    """A function whose results are cached by the identity of its arguments (`cached_by_identity`)."""
 
     def __call__(self, *args: Arguments.args, **kwargs: Arguments.kwargs) -> Produced_co: ...
 
     def know(self, argument: Any, result: Any) -> None:
-        """Store a result of a function of one tree that is known without being computed."""
+        """Store a result for a given argument that is known without calling the function; for functions of one argument."""
         ...
 
 
@@ -50,9 +50,16 @@ def cached_by_identity(function: Any = None, /, *, within_trace: bool = False) -
     """Cache the results of a function by its arguments: numbers and strings by value, others by identity.
 
     A result is stored as long as its arguments exist and it is one of the `CACHE_SIZE` most recently used results. Arguments must
-    not change. Results with traced numbers, which functions may hold in their closures, are stored only `within_trace`: if each
-    traced number belongs to a trace of the arguments' numbers, so that the result can be used wherever these can. Then the result
-    must not contain the arguments themselves.
+    not change.
+
+    Args:
+        function: the function; None if the decorator is used with `within_trace`.
+        within_trace: also store results with traced numbers, if each of these belongs to a trace of numbers of the arguments, so
+            that the result can be used wherever the arguments can. The result must not contain the arguments themselves then. If
+            False, results with traced numbers are not stored.
+
+    Returns:
+        The function with a cache.
     """
     if function is None:
         return partial(_cached_by_identity, within_trace=within_trace)
@@ -102,17 +109,17 @@ def _cached_by_identity(function: Callable[..., Any], within_trace: bool) -> Any
 
 @cached_by_identity
 def is_concrete(*trees: Any) -> bool:
-    """Return True if no number of immutable trees is traced; the answer is stored."""
+    """Return True if no number of immutable trees is traced; cached by the identities of the trees."""
     return not is_traced(trees)
 
 
 def _traces(tree: Any) -> set[int]:
-    """Return the traces of the numbers of a tree, which exist as long as it."""
+    """Return the identities of the traces to which numbers of a tree belong; these traces exist as long as the tree."""
     return {id(getattr(x, "_trace", x)) for x in jax.tree.leaves(tree) if isinstance(x, Tracer)}
 
 
 def _reference(x: object, forget: Callable[[Any], None]) -> Any:
-    """Return a weak reference that calls `forget` when the object is deleted; the object itself if it has none."""
+    """Return a weak reference that calls `forget` when the object is deleted; the object itself if it cannot have one."""
     try:
         return weakref.ref(x, forget)
     except TypeError:
@@ -123,12 +130,15 @@ def _reference(x: object, forget: Callable[[Any], None]) -> Any:
 
 
 class SizedFunction(Protocol[Arguments, Produced_co]):
-    """A function with a cache."""
+    """A function whose results are cached until all such caches take too much memory (`cached_by_size`)."""
 
     def __call__(self, *args: Arguments.args, **kwargs: Arguments.kwargs) -> Produced_co: ...
 
     def cache_info(self) -> _CacheInfo:
-        """Return the record of `functools.lru_cache`; its maximum is in bytes, of all caches."""
+        """Return the hits, misses and size of this function's cache, as functions with `functools.lru_cache` do.
+
+        `maxsize` is the limit of all caches together, in bytes; `currsize` is the number of stored results of this function.
+        """
         ...
 
     def cache_clear(self) -> None:
@@ -143,11 +153,16 @@ _LOCK = RLock()
 def cached_by_size(
     size: Callable[[Any], int], by_structure: bool = False
 ) -> Callable[[Callable[Arguments, Produced_co]], SizedFunction[Arguments, Produced_co]]:
-    """Cache the results of a function of hashable arguments; `size` estimates the bytes of a result.
+    """Return a decorator that caches the results of a function of hashable arguments, up to `MOST_BYTES` for all such functions.
 
-    If `by_structure`, arguments are trees of concrete numbers, and results are the same for all values of these: everything else
-    is compared (`structure_key.py`), functions among the leaves by identity. They may close over anything: results must not
-    depend on calling them.
+    Args:
+        size: function that estimates the memory of a result in bytes.
+        by_structure: for functions of trees of concrete numbers whose results do not depend on the values of these numbers. The
+            cache compares everything else in the trees (`structure_key.py`). Functions among the leaves are compared by identity
+            and may close over anything, so that results must not depend on calling them.
+
+    Returns:
+        The decorator.
     """
 
     def decorate(function: Callable[Arguments, Produced_co]) -> SizedFunction[Arguments, Produced_co]:
@@ -192,7 +207,7 @@ def cached_by_size(
 
 
 def stored_bytes() -> int:
-    """Return the estimated bytes of all stored results."""
+    """Return the estimated memory of all results stored by `cached_by_size`, in bytes."""
     with _LOCK:
         return sum(size for _, size in _STORED.values())
 

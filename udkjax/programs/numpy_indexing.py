@@ -33,7 +33,7 @@ def gather(
     fill_value: Any = None,
     **_: Any,
 ) -> np.ndarray:
-    """Return slices of an array that begin at the given indices (XLA's operation Gather)."""
+    """Return the slices of an array that begin at given indices, by the rules and parameters of `jax.lax.gather_p`."""
     d = dimension_numbers
     dropped = (*d.collapsed_slice_dims, *d.operand_batching_dims)
     batch, inside, places = _places(
@@ -59,7 +59,10 @@ def gather(
 
 
 def scatter(combine: Callable[[np.ndarray, Any, np.ndarray], None]) -> Callable[..., np.ndarray]:
-    """Change slices of an array (XLA's operation Scatter); `combine(array, places, updates)` changes entries."""
+    """Return a rule for one of JAX's scatter primitives, which update the slices of an array that begin at given indices.
+
+    `combine(array, places, updates)` changes, in place, the entries of an array at places with the updates.
+    """
 
     def apply(
         x: np.ndarray, indices: np.ndarray, updates: np.ndarray, dimension_numbers: Any, mode: GatherScatterMode, **_: Any
@@ -100,9 +103,12 @@ def _places(
     sizes: Sequence[int],
     mode: GatherScatterMode,
 ) -> tuple[int, np.ndarray | None, tuple[np.ndarray, ...]]:
-    """Return the number of batch dimensions, marks of slices within the array (None: all), and each entry's indices.
+    """Return the places of the entries of the slices that begin at `indices`, for a gather or a scatter.
 
-    Entries have the batch dimensions of `indices` first, then the dimensions of the slices.
+    Returns:
+        The number of batch dimensions; for each slice True if it lies within the array (None: all do, or are shifted so that they
+        do); and the places, an array of indices for each dimension of the array. These arrays have the batch dimensions of
+        `indices` first, then the dimensions of the slices.
     """
     indices = np.asarray(indices)
     batch_shape, batch = indices.shape[:-1], indices.ndim - 1

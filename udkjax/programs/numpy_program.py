@@ -24,12 +24,17 @@ _EVALUATIONS: dict[Primitive, Callable[..., Any]] = {}
 
 
 def expand_as(primitive: Primitive, function: Callable[..., Callable[..., Any]]) -> None:
-    """Expand a primitive into the operations of `function(**parameters)`, a function of arrays that JAX can trace."""
+    """Register the expansion of a primitive into other operations.
+
+    Args:
+        primitive: the primitive.
+        function: a function of the primitive's parameters that returns a function of its arrays, which JAX can trace.
+    """
     _EXPANSIONS[primitive] = function
 
 
 def expansion_of(primitive: Primitive, parameters: Mapping[str, Any]) -> Callable[..., Any] | None:
-    """Return the function into whose operations a primitive is expanded, ours or one of JAX's; None if there is none."""
+    """Return the function of arrays whose operations replace a primitive, from `expand_as` or from JAX; None if there is none."""
     if primitive in _EXPANSIONS:
         return _EXPANSIONS[primitive](**parameters)
     if "_prim" not in parameters:
@@ -39,16 +44,19 @@ def expansion_of(primitive: Primitive, parameters: Mapping[str, Any]) -> Callabl
 
 
 def evaluate_as(primitive: Primitive, function: Callable[..., Any]) -> None:
-    """Evaluate a primitive by a function of NumPy arrays and of its parameters."""
+    """Register a function of NumPy arrays, and of the parameters by keyword, that evaluates a primitive."""
     _EVALUATIONS[primitive] = function
 
 
 class TooLongError(Exception):
-    """A program exceeds its limit of operations."""
+    """An exception for an evaluation that exceeds its limit of operations (`Meter`)."""
 
 
 class Meter:
-    """Counts operations (an operation on a large array as several), and ends an evaluation that exceeds `limit`."""
+    """A count of operations, which ends an evaluation that exceeds `limit` by a `TooLongError`.
+
+    An operation on a large array counts as several.
+    """
 
     def __init__(self, limit: float):
         self.count, self.limit = 0, limit
@@ -60,9 +68,10 @@ class Meter:
 
 
 class NumpyProgram:
-    """A JAX program as NumPy steps.
+    """A JAX program as a list of NumPy steps.
 
-    The programs that it calls are part of it, and what does not depend on its inputs is computed once.
+    Programs that the JAX program calls are inlined. Operations that do not depend on its inputs are evaluated only once, when the
+    list is made, unless their results are large or their rule needs more than arrays.
     """
 
     def __init__(self, jaxpr: Jaxpr, constants: Sequence[Any]):
@@ -117,7 +126,7 @@ class NumpyProgram:
         return len(self._memory) - 1
 
     def _place_of_value(self, value: Any) -> int:
-        """Return the place of a constant, the same for the same content."""
+        """Return the place in the memory of a constant; constants of equal content share one."""
         key = value.dtype, value.shape, value.tobytes()
         if key not in self._constants:
             self._constants[key] = place = self._new()
@@ -126,7 +135,7 @@ class NumpyProgram:
         return self._constants[key]
 
     def __call__(self, meter: Meter, inputs: Sequence[Any]) -> list[Any]:
-        """Return the results for inputs that are NumPy arrays."""
+        """Return the results for inputs that are NumPy arrays; the meter counts the operations."""
         meter.add(self._cost)
         memory = self._memory.copy()
         memory[0] = meter
@@ -143,7 +152,7 @@ class NumpyProgram:
 
 
 def _called_program(equation: Any) -> tuple[Jaxpr, Sequence[Any]] | None:
-    """Return the program that an operation only calls, with its constants; None if it does anything else."""
+    """Return the program that an operation calls, with its constants; None if the operation is not merely such a call."""
     primitive = equation.primitive
     if primitive in _EVALUATIONS or primitive.name not in _CALLS:
         return None
@@ -152,7 +161,7 @@ def _called_program(equation: Any) -> tuple[Jaxpr, Sequence[Any]] | None:
 
 
 def _needed(jaxpr: Jaxpr) -> list[Any]:
-    """Return the operations on which a result depends, or that have effects, in their order."""
+    """Return the operations of a program that have effects or that its results depend on, in order."""
     used, needed = set[Any](v for v in jaxpr.outvars if not isinstance(v, Literal)), list[Any]()
     for equation in reversed(jaxpr.eqns):
         if equation.effects or not used.isdisjoint(equation.outvars):
@@ -178,7 +187,7 @@ def _type(v: Any) -> Any:
 
 
 def count_operations(jaxpr: Any) -> int:
-    """Return the number of operations of a program, counting bodies of loops and branches once."""
+    """Return the number of operations of a program; bodies of loops are counted once, and all branches are counted."""
     inner = (x for e in jaxpr.eqns for x in jaxprs_in_params(e.params))
     return len(jaxpr.eqns) + sum(map(count_operations, inner))
 
@@ -200,7 +209,7 @@ _PROGRAMS: "WeakKeyDictionary[Any, NumpyProgram]" = WeakKeyDictionary()
 
 
 def numpy_program(jaxpr: Any) -> NumpyProgram:
-    """Return the NumPy program of a jaxpr, with its constants if it is closed; cached."""
+    """Return the NumPy program of a jaxpr, which is closed or has no constants; cached by jaxpr."""
     program = _PROGRAMS.get(jaxpr)
     if program is None:
         arguments = (jaxpr.jaxpr, jaxpr.consts) if hasattr(jaxpr, "consts") else (jaxpr, ())
@@ -212,7 +221,7 @@ def numpy_program(jaxpr: Any) -> NumpyProgram:
 
 
 def _step_of(equation: Any) -> Callable[..., Any]:
-    """Return an operation as a function of the meter and its arguments."""
+    """Return an operation as a function of the meter and of the operation's NumPy arrays."""
     primitive, parameters = equation.primitive, equation.params
     if primitive in _EVALUATIONS:
         return lambda _, *xs: _EVALUATIONS[primitive](*xs, **parameters)
@@ -251,7 +260,10 @@ def _by_jax(primitive: Primitive, parameters: dict[str, Any], xs: Sequence[Any])
 
 
 class _Expanded:
-    """An operation that is expanded into others, traced at the first evaluation; JAX evaluates it if that is impossible."""
+    """A step that evaluates the operations into which an operation is expanded (`expansion_of`).
+
+    They are traced at the first evaluation. If there is no expansion, JAX evaluates the operation.
+    """
 
     def __init__(self, equation: Any):
         self._primitive, self._parameters = equation.primitive, equation.params
@@ -299,7 +311,7 @@ def _while(cond_jaxpr: Any, body_jaxpr: Any, cond_nconsts: int, body_nconsts: in
 
 
 def _where(condition: np.ndarray, a: Any, b: Any) -> np.ndarray:
-    """Select a where the condition holds, else b: some loops of a batch may have ended."""
+    """Return a where the condition holds, otherwise b; conditions have the leading axes of a, as in loops of a batch."""
     return np.where(condition.reshape(condition.shape + (1,) * (np.ndim(a) - condition.ndim)), a, b)
 
 

@@ -1,6 +1,6 @@
-"""NumPy rules for JAX primitives: functions of arrays and of the primitive's parameters.
+"""NumPy rules for JAX primitives: functions of arrays and of the primitive's parameters, which return the result.
 
-A rule may return `NotImplemented`: then JAX evaluates the operation.
+If a rule returns `NotImplemented`, JAX evaluates the operation.
 """
 
 import math
@@ -299,7 +299,10 @@ _OF_INTEGERS = frozenset(("add", "sub", "mul", "neg"))
 
 
 def exact_rule(name: str) -> Rule | None:
-    """Return the rule of a primitive if its results equal those of JAX bit by bit; None if there is no such rule."""
+    """Return a rule of a primitive whose results equal those of JAX bit by bit; None if there is no such rule.
+
+    For arguments for which this is not certain, the rule returns `NotImplemented`.
+    """
     if name not in _EXACT:
         return None
     rule = RULES[name]
@@ -315,5 +318,5 @@ def exact_rule(name: str) -> Rule | None:
 
 
 def _makes_integers(parameters: Mapping[str, Any]) -> bool:
-    """Return whether a conversion rounds, and so clips numbers that are too large."""
+    """Return True if parameters are those of a conversion to integers, for which JAX clips numbers that are too large."""
     return "new_dtype" in parameters and np.dtype(parameters["new_dtype"]).kind in "iu"

@@ -1,4 +1,4 @@
-"""Operations of JAX as functions of their arrays alone: what a program calls often, in the fewest calls of Python."""
+"""Operations of JAX as functions of their arrays alone, which take the fewest calls of Python at each evaluation."""
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -62,12 +62,15 @@ MOST_INPUTS = {"broadcast_in_dim": 1, "reshape": 1, "iota": 0}  # others are siz
 
 
 def plain_step(name: str, parameters: Mapping[str, Any], types: Sequence[Any]) -> Callable[..., Any] | None:
-    """Return an operation as a function of its arrays alone, one that always succeeds and preserves types; None if it is not one.
+    """Return an operation as a function of its NumPy arrays alone, without parameters.
 
     Args:
         name: the name of the primitive.
         parameters: its parameters.
-        types: the types of its inputs and of its outputs.
+        types: the types of its inputs, then of its outputs.
+
+    Returns:
+        The function, which always succeeds and returns arrays of the right type; None if there is no such function.
     """
     if any(x.dtype not in PRESERVED for x in types) or len(types) > MOST_INPUTS.get(name, len(types) - 1) + 1:
         return None

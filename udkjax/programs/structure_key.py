@@ -10,7 +10,10 @@ from udkjax.programs.deferred import ConcreteLeaf
 
 
 class StructureKey:
-    """A tree of concrete numbers, compared by everything except the values of inexact arrays; functions by identity."""
+    """A key of a cache: a tree of concrete numbers, compared by everything except the values of floating-point arrays.
+
+    Functions among the leaves are compared by identity.
+    """
 
     def __init__(self, tree: Any):
         leaves, form = jax.tree.flatten(tree)

@@ -5,13 +5,15 @@ Everywhere in the package, in forward and in reverse mode:
     where a value is NaN, so is its tangent;
     a cotangent of such a value that is zero contributes nothing, and any other makes all cotangents NaN.
 
-Therefore `where(ok, x, 0)` has the derivatives of x where x is defined, and zero elsewhere. Left to itself, JAX gives a NaN that
-stands for a failure the tangent of a constant, zero, and in reverse mode it multiplies zero cotangents by infinite slopes.
+Therefore `where(ok, x, 0)` has the derivatives of x where x is defined, and zero elsewhere. Without this rule, JAX would treat a
+NaN that stands for a failure as a constant, whose tangent is zero, and in reverse mode multiply zero cotangents by infinite
+slopes.
 
-Two linear primitives enclose the linear map of a derivative. `enter` passes its directions on with a token, a zero, and `leave`
-passes on its results, with NaN where values are undefined. In reverse mode, `leave` comes first: it drops cotangents of
-undefined values, and the cotangent of the token tells `enter` which cotangents remain: LOST, some or none. If none remain,
-a NaN that the map makes of zeros is zero.
+Two linear primitives enclose the linear map of a derivative. `enter` passes on the directions and a token, which is zero; `leave`
+passes on the results of the map, with NaN where values are undefined. In reverse mode, `leave` comes first and drops the
+cotangents of undefined values. The cotangent of the token tells `enter` about them: LOST if one of them was not zero; otherwise a
+number that is zero if no other cotangent is nonzero either. In that case `enter` replaces a NaN that the map makes of zeros by
+zero.
 """
 
 import functools
@@ -70,9 +72,9 @@ def defined(function: Callable[..., Result]) -> Callable[..., Result]:
 
 
 def _as_mapped(results: list[Array], xs: Sequence[Array]) -> list[Array]:
-    """Return results that `vmap` maps wherever it maps an argument.
+    """Return the results, unchanged in value, but batched by every `vmap` that batches an argument.
 
-    The tangents of all results are mapped then, by the token, and JAX requires it of the results that they belong to.
+    The token makes the tangents of all results batched, and JAX requires the same of the results themselves.
     """
     mapped = [x for x in xs if type(x) in _mapped_types() and x.size]
     if not mapped:
@@ -83,7 +85,7 @@ def _as_mapped(results: list[Array], xs: Sequence[Array]) -> list[Array]:
 
 @functools.cache
 def _mapped_types() -> tuple[type, ...]:
-    """Return the types of numbers that `vmap` traces with."""
+    """Return the types of tracers that `vmap` uses."""
     types: list[type] = []
     with jax.ensure_compile_time_eval():
         jax.vmap(lambda x: [types.append(type(x)), x][1])(np.zeros(1))
@@ -91,12 +93,18 @@ def _mapped_types() -> tuple[type, ...]:
 
 
 def at_each(function: Callable[..., Result], shared: Any, *members: Any) -> Result:
-    """Map function(shared, *members) over the members; its derivatives have the rule of this module for each member."""
+    """Return the results of function(shared, *members) for all members, which the first axes of arrays in `members` number.
+
+    Derivatives have the rule of this module, for each member separately.
+    """
     return jax.vmap(defined(function), (None, *[0] * len(members)))(shared, *members)
 
 
 def whole(*arrays: Array) -> list[Array]:
-    """Return arrays that are NaN as a whole if any of their numbers is: a state that is partly undefined has no derivatives."""
+    """Return the arrays; if any number of any array is NaN, all numbers of all arrays are NaN.
+
+    A state that is partly undefined thus has no derivatives.
+    """
     is_defined = functools.reduce(operator.and_, (jnp.all(~jnp.isnan(x)) for x in arrays))
     return [x + jnp.where(is_defined, 0.0, jnp.nan) for x in arrays]  # cotangents pass, NaN as well
 
@@ -131,13 +139,16 @@ def _no_tangent(x: Array) -> Any:
 
 
 def defined_along(linear: LinearMap, directions: Sequence[Array], values: Sequence[Array]) -> list[Array]:
-    """Return the tangents of the first `values`, linear in the directions, by the rule of this module."""
+    """Return the results of `linear(directions)`, the tangents of values, with the rule of this module for undefined values.
+
+    There may be more `values` than tangents: those that follow the first ones only determine the batch.
+    """
     entered, token = _enter(directions, values)
     return [_leave(dx, token, x) for x, dx in zip(values, linear(entered), strict=False)]
 
 
 def _enter(directions: Sequence[Array], like: Sequence[Array]) -> tuple[list[Array], Array]:
-    """Return directions with their token, which is batched as other arrays are."""
+    """Return the directions, and a token that is batched over all members over which any of the arrays `like` is batched."""
     *entered, token = enter_p.bind(*map(_array, directions), *zero_p.bind(*map(_array, like), members=0))
     return entered, token
 
@@ -147,7 +158,7 @@ def _array(x: Any) -> Array:
 
 
 def _leave(tangent: Array, token: Array, value: Array) -> Array:
-    """Return the tangent of a value."""
+    """Return the tangent of a value: NaN where the value is."""
     return leave_p.bind(_array(tangent), token, jax.lax.stop_gradient(jnp.isnan(value)))[0]
 
 
@@ -191,12 +202,18 @@ def _leave_transposed(cotangents: Sequence[Any], tangent: Any, token: Any, undef
 
 
 def _of_shape(x: Array, like: Array) -> Array:
-    """Give a number of each member the shape of `like`."""
+    """Return a number of each member of a batch, repeated to the shape of `like`."""
     return jax.lax.broadcast_in_dim(x, like.shape, tuple(range(jnp.ndim(x))))
 
 
 def _primitive(name: str, by_jax: Callable[..., list[Array]], transposed: Callable[..., list[Any]]) -> Primitive:
-    """Return a primitive that is linear in all inputs but the last."""
+    """Return a new primitive that is linear in all inputs but the last, with its rules for derivatives, batches and lowering.
+
+    Args:
+        name: the name of the primitive.
+        by_jax: its definition.
+        transposed: its transpose: a function of cotangents of results and of the inputs, as JAX calls it in reverse mode.
+    """
     primitive = Primitive(name)
     primitive.multiple_results = True
     primitive.def_impl(by_jax)

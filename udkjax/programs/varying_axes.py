@@ -21,7 +21,10 @@ def result_type(shape: Sequence[int], inputs: Sequence[Any], dtype: Any = float)
 
 
 def vary_together(xs: Sequence[Array]) -> list[Array]:
-    """Make arrays vary over all devices over which any of them varies: the transpose sums cotangents over these devices."""
+    """Return arrays of the same values that vary over all devices over which any of them varies.
+
+    The transpose sums cotangents over these devices.
+    """
     if not any(map(varies, xs)):
         return list(xs)
     zero = sum(zero_of(x) for x in xs)
@@ -29,7 +32,7 @@ def vary_together(xs: Sequence[Array]) -> list[Array]:
 
 
 def varies(x: Any) -> bool:
-    """Return True for an array that varies over devices."""
+    """Return True for a traced array that varies over devices, within `jax.shard_map`."""
     return isinstance(x, Tracer) and _axis_count(jax.typeof(x)) > 0
 
 

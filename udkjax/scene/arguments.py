@@ -1,8 +1,8 @@
 """Checks of the arguments of public functions, before anything is computed.
 
 `@checked` reads the annotations of a function's parameters. An argument must be an instance of an annotated class, or a choice of
-a `Literal`; what instances of a class must be besides is registered by `checks_instances`. Metadata of `Annotated` say what else
-an argument must be (udkjax/argument_types.py): shapes must fit the mechanism, numbers must be real, finite and of the right sign.
+a `Literal`; further requirements on instances of a class are registered by `checks_instances`. Metadata of `Annotated` state all
+other requirements (udkjax/argument_types.py): shapes must fit the mechanism, numbers must be real, finite and of the right sign.
 Single numbers, integers and lists of names need no metadata. For traced values only shapes and dtypes are checked;
 `concrete_only` (udkjax/requirements.py) refuses them.
 """
@@ -82,7 +82,7 @@ def checked(function: Callable[Arguments, Result]) -> Callable[Arguments, Result
 
 
 def _refusal(error: Result) -> Result:
-    """Return an error whose message says all, without the frames in which it was found, and what JAX says about its own."""
+    """Return an error without its traceback, since its message is sufficient, and without the note that JAX adds to it."""
     if notes := getattr(error, "__notes__", None):
         notes[:] = [note for note in notes if "JAX" not in note]
     return error.with_traceback(None)  # pyright: ignore[reportAttributeAccessIssue]
@@ -121,7 +121,10 @@ def bind_arguments(name: str, parameters: Signature, args: Sequence[Any], kwargs
 
 
 def argument_problems(function: Callable[..., object], given: GivenArguments) -> list[str]:
-    """Return the mistakes in the arguments `given` by name, which must include the mechanism."""
+    """Return messages about all mistakes that checks find in arguments, `given` by name, without calling the function.
+
+    Arguments may be left out, except the mechanism, to which others must fit.
+    """
     problems: list[str] = []
     for name, check, if_none in _checks_of(function):
         try:
@@ -133,7 +136,7 @@ def argument_problems(function: Callable[..., object], given: GivenArguments) ->
 
 
 class ParameterCheck(NamedTuple):
-    """A check of a parameter; for None, `if_none` determines whether the check is applied, passes, or fails."""
+    """A check of a parameter. If the argument is None, it is checked ("takes"), accepted ("passes") or refused ("refuses")."""
 
     name: str
     check: ArgumentCheck
@@ -167,7 +170,7 @@ def _unfold(annotation: Any) -> tuple[tuple[Any, ...], tuple[ArgumentCheck, ...]
 
 
 def _check_of_type(types: tuple[Any, ...]) -> ArgumentCheck | None:
-    """Return the check of an annotation that consists of classes, or of choices; None for any other."""
+    """Return the check of an annotation that consists of this package's classes, bool, str and choices; None for any other."""
     choices = [choice for x in types if get_origin(x) is Literal for choice in get_args(x)]
     classes = tuple(x for x in types if get_origin(x) is not Literal)
     if not _are_ours(classes):
@@ -185,7 +188,7 @@ def _check_of_type(types: tuple[Any, ...]) -> ArgumentCheck | None:
 
 
 def _checks_of_kind(types: tuple[Any, ...]) -> tuple[ArgumentCheck, ...]:
-    """Return the check of an integer, a number or names; none for anything else."""
+    """Return the check of an integer, a number or names, as a tuple; () for any other types."""
     kinds = {x for x in types if x is not type(None)}
     if kinds == {int}:
         return (partial(require_count, least=-math.inf),)
@@ -230,7 +233,7 @@ def _describe_class(cls: type) -> str:
 
 
 def _remedy(name: str, value: Any, classes: Sequence[type]) -> str:
-    """Return the advice to give an instance of a class, or the state of a result; else an empty string."""
+    """Return the advice, for a message, to give an instance of a class or the state of a result; "" if neither applies."""
     if (state := getattr(value, "state", None)) is not None and isinstance(state, tuple(classes)):
         return f"; give its state: {name}=x.state"
     if any(x.__name__ == "State" for x in classes) and np.ndim(getattr(value, "q", None)) == 3 and hasattr(value, "v"):
@@ -264,7 +267,7 @@ def _choice(known: tuple[Any, ...]) -> ArgumentCheck:
 
 @checks_instances(Mechanism)
 def _require_usable(name: str, value: Mechanism, given: GivenArguments) -> None:
-    """Require a single mechanism, not a batch, whose numbers have a meaning."""
+    """Raise an error if a mechanism is a batch of mechanisms, or has numbers without a meaning, such as a negative mass."""
     if (shape := np.shape(value._source.gravity)) != (2,):
         cure = "map over it: jax.vmap(lambda one: ...)(mechanisms)"
         raise ArgumentError(f"{name} is a batch of mechanisms, whose gravity has the shape {shape}, not (2,): {cure}")

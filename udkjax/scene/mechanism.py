@@ -59,8 +59,8 @@ Module = TypeVar("Module", bound=eqx.Module)
 class Mechanism(PrintsTable, Model, ConvertsItself):
     """Bodies, joints, drivers and force elements by name, and gravity.
 
-    It is only data; `udkjax.analyse` finds its properties, such as redundant rows. All independent numbers are leaves of the
-    pytree, and others are computed from them at use; names, topology and types are static. The user's order is kept:
+    A mechanism is only data; `udkjax.analyse` finds its properties, such as redundant rows. All independent numbers are leaves of
+    the pytree, and others are computed from them at use; names, topology and types are static. The user's order is kept:
     `constraints` are the joints in their order, then the drivers. `forces` may be a list: unnamed elements are numbered by type,
     TYPE1, TYPE2, ... Numbers that a joint leaves to the initial guess are filled in here.
 
@@ -71,8 +71,8 @@ class Mechanism(PrintsTable, Model, ConvertsItself):
         joints: a joint by name.
         drivers: a `Driver` by name.
         forces: a force element by name, or a list of them.
-        gravity: in m/s^2.
-        name: of the mechanism, for titles and files.
+        gravity: the acceleration of gravity (m/s^2).
+        name: name of the mechanism, for titles and files.
         origin: for internal use: the concrete mechanism from which one with traced numbers was made.
     """
 
@@ -113,7 +113,7 @@ class Mechanism(PrintsTable, Model, ConvertsItself):
         _checked(self)
 
     def with_drivers(self, drivers: Mapping[str, Driver], origin: Origin | None = None) -> "Mechanism":
-        """For internal use: return the mechanism with other drivers, which are complete; nothing is checked."""
+        """For internal use: return the mechanism with other drivers, from which no number is missing; nothing is checked."""
         sections = {section: list(group.items()) for section, group in (self.groups | {"driver": drivers}).items()}
         found = make_module(type(self), **fields_of(sections, self.gravity, self.name, origin))
         return found if drivers or not _is_checked(self) else _checked(found)
@@ -149,12 +149,12 @@ class Mechanism(PrintsTable, Model, ConvertsItself):
 
     @property
     def drawing(self) -> AbstractDrawing | None:
-        """The `Drawing` of a mechanism that was made from one: pins and links, whose numbers are the mechanism's leaves."""
+        """The `Drawing` from which the mechanism was made: pins and links, whose numbers are its leaves; None without one."""
         return self._source.drawing if isinstance(self._source, Drawn) else None
 
     @property
     def massless(self) -> tuple[str, ...]:
-        """The links of a drawing for which no mass is given."""
+        """The names of the links of a drawing for which no mass is given, neither in the drawing nor directly."""
         source = self._source
         if not isinstance(source, Drawn) or not source.drawing.massless:
             return ()
@@ -244,13 +244,13 @@ class Mechanism(PrintsTable, Model, ConvertsItself):
 
     @property
     def samples(self) -> dict[tuple[str, int, str], Any]:
-        """The sampled numbers, each a `Held` or a `Spline`, by section, index and field."""
+        """The sampled numbers, each a `Held` or a `Spline`, by place: "_drivers" or "_forces", index of the element, field."""
         sections = {"_drivers": self._drivers, "_forces": self._forces}
         locations = [(section, *location) for section, elements in sections.items() for location in sampled_fields(elements)]
         return {location: getattr(sections[location[0]][location[1]], location[2]) for location in locations}
 
     def with_samples(self, samples: Mapping[tuple[str, int, str], Any]) -> "Mechanism":
-        """Return the mechanism with other values of `samples`, without checks."""
+        """Return the mechanism with other sampled numbers, by the keys of `samples`, without checks."""
         if not samples:
             return self
         changed = {section: list(getattr(self, section)) for section in ("_drivers", "_forces")}
@@ -261,11 +261,11 @@ class Mechanism(PrintsTable, Model, ConvertsItself):
 
     @property
     def without_samples(self) -> "Mechanism":
-        """The mechanism from which programs are made: its samples are a single interval of zeros."""
+        """The mechanism from which programs are generated: each sampled number has a single interval, whose numbers are zero."""
         return self.with_samples({location: with_row(x, np.zeros(row_size(x))) for location, x in self.samples.items()})
 
     def at(self, t: NumberLike) -> "Mechanism":
-        """Return the mechanism with the samples of a single interval, the one at time t (s)."""
+        """Return the mechanism with only one interval of each sampled number: the one that contains time t (s)."""
         samples = self.samples
         traced = is_traced((t, samples))
         xp, eager = (jnp, nullcontext()) if traced else (np, jax.ensure_compile_time_eval())
@@ -281,7 +281,10 @@ class Mechanism(PrintsTable, Model, ConvertsItself):
         return self if type(self._source) is Elements and self.origin is None else _without_origin(self)
 
     def without_origin_beside(self, names: Sequence[str]) -> "Mechanism":
-        """Return `without_origin`, or, where numbers of these names determine others, the mechanism with its drawing or guess."""
+        """Return the mechanism for programs in which the numbers of these names change: `without_origin`, if that is possible.
+
+        If these numbers determine others, the result keeps the drawing and the initial guess, from which those follow.
+        """
         if all(name.startswith("force.") for name in names):  # loads determine nothing else
             drawn = () if self.drawing is None else parameters_of_drawing(self.drawing)
             if not any(split_index(name, parameters_of(self))[0] in drawn for name in names):
@@ -289,7 +292,10 @@ class Mechanism(PrintsTable, Model, ConvertsItself):
         return self if self.origin is None else _copy(self, {"origin": None})
 
     def know_elements(self, known: "Mechanism") -> None:
-        """Store the result of `without_origin` for the same numbers, so that a program does not compute it again."""
+        """Store `known` as the result of `without_origin`, so that a program does not compute it again.
+
+        The numbers of `known` must be those of this mechanism.
+        """
         elements_of.know(self._source, known._source.elements)
         _without_origin.know(self, known)
 
@@ -385,7 +391,10 @@ class Mechanism(PrintsTable, Model, ConvertsItself):
         return _checked(make_module(type(self), **fields_of(sections, gravity, self.name, origin)))
 
     def _valid_elements(self, groups: Groups, gravity: Array) -> Groups | None:
-        """Return other elements that are valid since this mechanism is, with their missing numbers; None if that is not known."""
+        """Return other elements, with missing numbers filled in, if they are valid because this mechanism is (see `replaced`).
+
+        None if all elements have to be checked.
+        """
         if not _is_checked(self) or (gravity is not self.gravity and gravity_mistakes(gravity)):
             return None
         return replaced(self.groups, groups)
@@ -418,7 +427,7 @@ _USABLE: WeakValueDictionary[int, Source] = WeakValueDictionary()  # sources of 
 
 
 def _checked(mechanism: Mechanism) -> Mechanism:
-    """Return a mechanism of which all elements are known to be valid."""
+    """Return a mechanism after noting that all its elements are valid."""
     _VALID[id(mechanism._source)] = mechanism._source
     return mechanism
 
@@ -430,7 +439,8 @@ def _is_checked(mechanism: Mechanism) -> bool:
 def require_valid_numbers(mechanism: Mechanism) -> None:
     """Raise a `SceneError` that names concrete numbers without meaning, such as a negative mass.
 
-    Only leaves that an optimizer or `tree_at` changed can be meaningless. Binding a method of Equinox would take longer.
+    Only leaves that an optimizer or `tree_at` changed can be meaningless. This is no method, since binding a method of an
+    Equinox module takes longer.
     """
     source = mechanism._source
     if _VALID.get(id(source)) is source or _USABLE.get(id(source)) is source or not is_concrete(mechanism):
@@ -441,7 +451,7 @@ def require_valid_numbers(mechanism: Mechanism) -> None:
 
 
 def _check_without_derivatives(mechanism: Mechanism, values: dict[str, Any]) -> None:
-    """Raise the errors of `with_parameters` with concrete numbers, if the numbers are traced only by derivatives."""
+    """Raise the errors that `with_parameters` raises for concrete numbers, if numbers are traced only for derivatives."""
     if is_within_jit():
         return
     known, plain = without_derivatives(values), mechanism

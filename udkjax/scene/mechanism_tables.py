@@ -40,7 +40,7 @@ def mechanism_text(mechanism: Mechanism) -> str:
 
 
 def check_known(tree: eqx.Module, name: str) -> None:
-    """Raise a `SceneError` if numbers are traced."""
+    """Raise a `SceneError` if numbers of a mechanism or a drawing are traced; `name` is its name, for the message."""
     if is_traced(tree):
         raise SceneError(["its numbers are traced: write it outside of jit, vmap and grad"], name)
 
@@ -75,7 +75,7 @@ def head_mistakes(scene: TomlTable, expected: Collection[str]) -> Iterator[str]:
 def read_section(
     section: str, tables: object, problems: list[str], cls: type | None = None, counted: bool = False
 ) -> Iterator[SceneEntry]:
-    """Iterate over the entries of one section; add to the problems if it is not a list of tables.
+    """Iterate over the entries of one section; if it is not a list of tables, there are none, and a problem is added.
 
     The class of an entry is `cls`, or follows from its `type`. If `counted`, unnamed entries are numbered: SECTION1, ...
     """
@@ -96,7 +96,7 @@ def read_section(
 
 
 def check_classes(where: str, cls: type, table: TomlTable) -> Iterator[str]:
-    """Iterate over the classes in an element for which the format has no type."""
+    """Iterate over messages about classes that a file cannot hold: the class `cls` of an element, and those of its modules."""
     if not is_in_format(cls):
         yield f"{where}: a scene file has no type for the class {cls.__name__}; keep this scene in Python"
     for name, value in table.items():
@@ -105,7 +105,7 @@ def check_classes(where: str, cls: type, table: TomlTable) -> Iterator[str]:
 
 
 def type_key(cls: type) -> dict[str, str]:
-    """Return the `type` key for the class of an element, if the format requires one."""
+    """Return the key `type` with its value for the class of an element; empty for classes whose tables have no `type`."""
     return {} if cls in CLASSES_WITHOUT_TYPE.values() else {"type": type_name(cls)}
 
 
@@ -154,7 +154,7 @@ def parse_toml(text: str, source: str, error: type[Mistakes]) -> dict[str, Any]:
         The tables.
 
     Raises:
-        Mistakes: `error`; the text is not TOML, nests too deeply, or contains a number with thousands of digits.
+        Mistakes: The text is not TOML, nests too deeply, or has numbers or keys that are far too long; of the class `error`.
     """
     if (key := _LONG_KEY.search(text)) is not None:
         line = text.count("\n", 0, key.start()) + 1

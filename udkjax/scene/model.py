@@ -1,6 +1,7 @@
-"""The questions that runs and studies ask of a model, whichever kind it is: a `Mechanism`, or a user-defined system.
+"""The questions that runs and studies ask of a model of either kind: a `Mechanism`, or a user-defined system.
 
-What needs the equations of motion is not asked here: `equations_of` and `analysis_of` in `udkjax/equations` answer for all kinds.
+Questions that need the equations of motion are answered, for both kinds, by `equations_of` and `analysis_of` in
+`udkjax/equations`.
 """
 
 from abc import abstractmethod
@@ -24,8 +25,8 @@ class RunModel(QuickMethods):
     """The questions that a run asks of a model. By default it has coordinates alone: no bodies, elements or sampled numbers.
 
     Attributes:
-        has_bodies: whether coordinates are those of bodies, and rows those of joints and drivers.
-        has_programs: whether programs are made of the model, not functions of JAX alone.
+        has_bodies: True if coordinates are those of bodies, and rows those of joints and drivers.
+        has_programs: True if programs are generated from the model; False if it has functions of JAX alone.
         body_names: the names of the bodies, in the order of coordinates.
     """
 
@@ -59,17 +60,20 @@ class RunModel(QuickMethods):
         raise NotImplementedError
 
     def state_shape(self, state: object = None) -> tuple[int, ...]:
-        """Return the shape of coordinates, (bodies, 3) or (n,); of a system by a state or its guess, else ()."""
+        """Return the shape of the coordinates: (bodies, 3), or that of a user-defined system.
+
+        The latter follows from the coordinates of `state`, or of the initial guess if `state` is None; () if neither is known.
+        """
         return (self.coordinate_count,)
 
     @property
     def may_have_kinks(self) -> bool:
-        """True if jumps or kinks of its loads may be located."""
+        """True if the model's loads may have jumps or kinks, which a run has to locate."""
         return False
 
     @property
     def massless(self) -> tuple[str, ...]:
-        """The links of a drawing for which no mass is given; positions, velocities and driven motions need none."""
+        """The names of the links of a drawing for which no mass is given; positions, velocities and driven motions need none."""
         return ()
 
     def require_masses(self, asked_by: str, cure: str = "") -> None:
@@ -80,7 +84,7 @@ class RunModel(QuickMethods):
             cure: Another cure than a mass: "let motors determine the motion".
 
         Raises:
-            ArgumentError: A link has none.
+            ArgumentError: A link has no mass.
         """
         if names := self.massless:
             links, lacks = join_names([quote(name) for name in names]), "has" if len(names) == 1 else "have"
@@ -89,11 +93,14 @@ class RunModel(QuickMethods):
 
     @property
     def without_origin(self) -> Self:
-        """The model that programs are made of, without anything that does not enter the equations."""
+        """The model from which programs are generated, without anything that does not enter the equations."""
         return self
 
     def without_origin_beside(self, names: Sequence[str]) -> Self:
-        """Return `without_origin`, as far as numbers of these names, which are set later, determine no others."""
+        """Return the model for programs in which the numbers of these names change: `without_origin`, if that is possible.
+
+        If these numbers determine others, the result keeps the parts of the model from which those follow.
+        """
         return self.without_origin
 
     def at(self, t: Time) -> Self:
@@ -101,7 +108,7 @@ class RunModel(QuickMethods):
         return self
 
     def with_samples(self, samples: Mapping[Any, Any]) -> Self:
-        """Return the model with other sampled numbers."""
+        """Return the model with other sampled numbers, by the places of `Mechanism.samples`."""
         return self
 
     def require_bodies(self, message: str) -> None:
@@ -122,12 +129,12 @@ class Model(RunModel):
     @property
     @abstractmethod
     def q0(self) -> Float[Array, "..."] | None:
-        """The initial guess of the coordinates; None: states are given."""
+        """The initial guess of the coordinates; None if the model has none, so that states must be given."""
 
     @property
     @abstractmethod
     def v0(self) -> Float[Array, "..."] | None:
-        """The initial guess of the velocities."""
+        """The initial guess of the velocities; None if the model has none."""
 
     @abstractmethod
     def number_fields(self) -> Mapping[str, NumberField]:
@@ -154,5 +161,8 @@ class Model(RunModel):
         """Return the model with another initial guess."""
 
     def traced(self, n: int) -> Any:
-        """Return the model with n coordinates of which programs are made."""
+        """Return the model from which programs are generated, for n coordinates: a `TracedSystem` for a `ConstrainedSystem`.
+
+        Other models return themselves, and so do all models without float64.
+        """
         return self

@@ -123,7 +123,10 @@ def attachments(mechanism: Mechanism, body: str) -> Iterator[tuple[str, Float[Ar
 
 
 def _move_along_pins(before: Mechanism, after: Mechanism) -> Mechanism:
-    """Move bodies by the displacement of the pins that hold them: if nothing has changed, the guess does not change."""
+    """Return `after` with its bodies moved so that no pin of the tree opens more than in `before`.
+
+    Each body moves by the displacement of the pin that holds it: if no pin moves, the initial guess does not change.
+    """
     old = {GROUND: GROUND_FRAME_AT_REST} | {name: body.frame() for name, body in before.bodies.items()}
     new = {GROUND: GROUND_FRAME_AT_REST} | {name: body.frame() for name, body in after.bodies.items()}
     values: dict[str, Numbers] = {}

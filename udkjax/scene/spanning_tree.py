@@ -10,7 +10,7 @@ from udkjax.scene.mechanism import Mechanism
 
 
 class TreeEdge(NamedTuple):
-    """A body, its holder (parent) and the joint between them; without a joint the body is a root, like the ground."""
+    """A body, its holder (parent) and the joint between them; if `joint` is "", the body is a root, like the ground."""
 
     body: str
     holder: str

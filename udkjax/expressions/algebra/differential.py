@@ -26,7 +26,7 @@ SparseRow = dict[int, Scalar]  # partial derivatives by the index of the variabl
 class Differential:
     """The differentials of `outputs` with respect to `inputs`.
 
-    `fixed` scalars are constant. Nodes on which `inputs` and `fixed` depend are not differentiated.
+    Scalars in `fixed` are treated as constants. Nodes from which `inputs` or `fixed` are computed are not differentiated.
     """
 
     def __init__(self, graph: Graph, outputs: Iterable[Scalar], inputs: Sequence[Scalar], fixed: Iterable[Scalar] = ()):
@@ -40,12 +40,15 @@ class Differential:
                 self._rows[index] = row
 
     def row(self, output: Scalar) -> SparseRow:
-        """Return the partial derivatives of one output."""
+        """Return the partial derivatives of one output with respect to inputs and to results of opaque nodes."""
         row = self._rows.get(output.index, {})
         return row if output.sign > 0 else {k: -p for k, p in row.items()}
 
     def forward(self, tangents: Mapping[int, Scalar]) -> SparseRow:
-        """Return the tangents of all nodes that rows refer to, by index, from those of inputs; other inputs are constant."""
+        """Return the tangents by which rows are multiplied, by the index of the node: those of inputs and of opaque results.
+
+        `tangents` are those of inputs; inputs without one are constant.
+        """
         all_tangents = {k: t for k, t in tangents.items() if not t.is_zero}
         for call, results in self._calls.items():
             arguments = [product(self.row(a), all_tangents, self.graph) for a in self.graph.nodes[call].arguments]
@@ -53,7 +56,11 @@ class Differential:
         return all_tangents
 
     def reverse(self, cotangents: SparseRow) -> list[Scalar]:
-        """Return the cotangents of the inputs from the cotangents, by index, of all nodes that rows refer to."""
+        """Return the cotangent of each input.
+
+        `cotangents` has, by the index of the node, the sums of rows weighted by the cotangents of outputs: those of inputs and
+        of results of opaque nodes. The latter are passed on to the arguments of these nodes.
+        """
         all_cotangents = dict(cotangents)
         for call, results in reversed(self._calls.items()):
             seeds = {k: all_cotangents.pop(k) for k in results if k in all_cotangents}
@@ -99,8 +106,8 @@ def tangents(
         graph: The graph of all scalars.
         outputs: The functions f.
         seeds: The tangents dx by input; an input without one is constant.
-        given: Nodes already computed. If not None, a factor common to all df/dx of an x is taken out of the sums and multiplies
-            dx.
+        given: Indices of nodes that are computed anyway, so that splitting them saves nothing. If not None, a factor that all
+            df/dx of one input x share multiplies dx once, instead of being part of each df/dx.
 
     Returns:
         The tangent of each output.
@@ -129,7 +136,7 @@ def cotangents(
         outputs: The functions.
         seeds: The cotangent of each output.
         inputs: The variables.
-        given: Nodes already computed; see `tangents`.
+        given: Indices of nodes that are computed anyway; see `tangents`.
 
     Returns:
         The cotangent of each input.
@@ -153,12 +160,12 @@ def _factored(
 
 
 def product(row: SparseRow, vector: Mapping[int, Scalar], graph: Graph) -> Scalar:
-    """Return the product of a row and a vector."""
+    """Return the product of a sparse row and a vector; entries that either of them lacks are zero."""
     return sum((p * vector[k] for k, p in row.items() if k in vector), graph.constant(0.0))
 
 
 def accumulate(total: SparseRow, row: SparseRow, factor: Scalar) -> None:
-    """Add a multiple of a row to another one."""
+    """Add `factor` times `row` to the row `total`, in place."""
     if factor.is_zero:
         return
     for k, p in row.items():
@@ -166,9 +173,10 @@ def accumulate(total: SparseRow, row: SparseRow, factor: Scalar) -> None:
 
 
 def common_factors(rows: Sequence[SparseRow], given: Collection[int] = ()) -> tuple[list[SparseRow], SparseRow]:
-    """Divide each column of a matrix by the common factor of its entries; return the rows and the factors by column.
+    """Divide each column of a matrix by a factor that its entries share, if any; return the new rows, and factors by column.
 
-    One product with the tangent of a column replaces a product for each entry. `given` nodes are not factored.
+    One product with the tangent of a column replaces a product for each entry. Columns of one entry are left as they are, and
+    entries whose nodes are in `given` are not split into factors.
     """
     columns: dict[int, list[Scalar]] = {}
     for row in rows:
@@ -196,7 +204,7 @@ def _without(entry: Scalar, factor: Scalar) -> Scalar:
 
 
 def _push_forward(graph: Graph, call: int, results: Sequence[int], tangents: Sequence[Scalar]) -> SparseRow:
-    """Return the tangents of the results of an opaque node."""
+    """Return the nonzero tangents of `results` of an opaque node, by index, from the tangents of all its arguments."""
     node = graph.nodes[call]
     arrays, dots = _arrays(node, node.arguments), _arrays(node, tangents)
     active = [k for k, dot in enumerate(dots) if any(not s.is_zero for s in dot.flat)]
@@ -213,7 +221,10 @@ def _push_forward(graph: Graph, call: int, results: Sequence[int], tangents: Seq
 
 
 def _pull_back(graph: Graph, call: int, seeds: SparseRow, flags: Sequence[bool]) -> list[Scalar]:
-    """Return the cotangents of the arguments of an opaque node from the cotangents of its results."""
+    """Return the cotangents of the arguments of an opaque node from the cotangents `seeds` of its results, by index.
+
+    `flags` has True for each argument that depends on the inputs. The cotangents of an array without any such argument are zero.
+    """
     node = graph.nodes[call]
     arrays, wanted = _arrays(node, node.arguments), _outputs(graph, list(seeds))
     active = [k for k, flags in enumerate(_arrays(node, flags)) if flags.any()]
@@ -236,7 +247,10 @@ def _pull_back(graph: Graph, call: int, seeds: SparseRow, flags: Sequence[bool])
 def _restrict(
     detail: BoundPrimitive, arrays: Sequence[jax.Array], active: Sequence[int], wanted: Sequence[int]
 ) -> Callable[..., list[jax.Array]]:
-    """Return an array primitive as a function from some of its arguments to some of its results."""
+    """Return an array primitive as a function of its `active` arguments that returns a list of its `wanted` results.
+
+    Both are positions. The other arguments have the values in `arrays`.
+    """
 
     def function(*active_values):
         values = list(arrays)

@@ -71,7 +71,10 @@ class SymbolicFactors:
         return [x[c] for c in range(len(x))]
 
     def solve_transposed(self, right: Sequence[Scalar]) -> list[Scalar]:
-        """Solve A^T y = c for y; with more rows than columns, its entries in the rows of B have least norm."""
+        """Solve A^T y = c for y.
+
+        With more rows than columns, y is not unique: its entries in the rows of B are those of least norm.
+        """
         c, y = list(right), [self._graph.constant(0.0)] * len(self._rows)
         for r, k in self._pivots:
             y[r] = c[k] / self._rows[r][k]
@@ -95,7 +98,10 @@ class SymbolicFactors:
         return y
 
     def _sparsest_constant(self) -> tuple[int, int] | None:
-        """Return the position of the constant entry that causes the least fill."""
+        """Return the row and the column of the constant entry that causes the least fill as a pivot; None if none is left.
+
+        Entries that are small compared with their row are no pivots (`LEAST_PIVOT`).
+        """
         used = {r for r, _ in self._pivots}
         counts: dict[int, int] = {}
         remaining = [(r, row) for r, row in enumerate(self._rows) if r not in used]
@@ -124,7 +130,7 @@ class SymbolicFactors:
             self._rows[i] = {k: x for k, x in row.items() if not x.is_zero}
 
     def _rotate(self, a: list[list[Scalar]]) -> list[list[Scalar]]:
-        """Rotate pairs of rows until B is upper triangular."""
+        """Return B after rotations of pairs of its rows (`self._rotations`) that make it upper triangular: R."""
         graph = self._graph
         for k in range(len(self.open_columns)):
             for j in range(k + 1, len(a)):

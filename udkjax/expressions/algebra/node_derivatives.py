@@ -85,7 +85,7 @@ class ActiveNodes:
         return [_signed(found.get(s.index, zero), s) for s in self._inputs]
 
     def _slopes(self, index: int, node: Node) -> Iterator[tuple[Scalar, Scalar]]:
-        """Yield the arguments of a node that have derivatives, and the derivatives of the node by them."""
+        """Yield each argument of a node that has derivatives, with the partial derivative of the node with respect to it."""
         for k, a in enumerate(node.arguments):
             if a.index in self._active:
                 yield a, partial_derivative(self._graph, index, node, k)
@@ -96,12 +96,12 @@ def _signed(x: Scalar, a: Scalar) -> Scalar:
 
 
 def is_choice(node: Node) -> bool:
-    """Return whether a node is one of several cases."""
+    """Return True if a node selects one of several cases: JAX's `select_n`."""
     return node.kind == "apply" and node.detail.primitive.name == "select_n"
 
 
 def choose(graph: Graph, node: Node, which: Scalar, cases: Sequence[Scalar]) -> Scalar:
-    """Return the choice of a node, `which`, among other cases."""
+    """Return the selection that a node makes (`is_choice`), by the same argument `which`, but among other `cases`."""
     fold = lambda *values: values[1 + int(values[0])]  # noqa: E731
     return graph.apply(node.detail.primitive, node.detail.parameters, (which, *cases), node.dtype, fold)
 

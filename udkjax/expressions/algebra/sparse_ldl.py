@@ -1,4 +1,4 @@
-"""A = L diag(p) L^T of a symmetric matrix of scalars, unrolled: structural zeros are never computed."""
+"""The factorization A = L diag(p) L^T of a symmetric matrix of scalars, unrolled: structural zeros are never computed."""
 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -8,14 +8,17 @@ from udkjax.expressions.scalars.graph import Graph, Scalar
 
 
 class SparseLDL(NamedTuple):
-    """The factors of A, with which A x = b is solved for all rows, or for those that are eliminated first."""
+    """The factors of a symmetric matrix A.
+
+    They solve A x = b, or the system of only the first `count` rows and columns in the order of elimination (None: of all).
+    """
 
     order: Sequence[int]  # of elimination
     inverse: Sequence[Scalar]  # 1 / p by row; zero for a row that is left out
     below: Sequence[SparseRow]  # for each row r, the entries L[i, r] of the rows i after it
 
     def forward(self, b: Sequence[Scalar], count: int | None = None) -> list[Scalar]:
-        """Return L^(-1) b, for the first `count` rows of the order; the rest of b is returned unchanged."""
+        """Return L^(-1) b of the first `count` rows and columns of the order; the other entries of b are returned unchanged."""
         y, rows = list(b), self.order[:count]
         for r in rows:
             for i, entry in self.below[r].items():
@@ -24,7 +27,7 @@ class SparseLDL(NamedTuple):
         return y
 
     def backward(self, y: Sequence[Scalar], count: int | None = None) -> list[Scalar]:
-        """Return L^(-T) y, for the first `count` rows of the order; the rest of y is returned unchanged."""
+        """Return L^(-T) y of the first `count` rows and columns of the order; the other entries of y are returned unchanged."""
         x, rows = list(y), self.order[:count]
         for r in reversed(rows):
             for i, entry in self.below[r].items():
@@ -37,7 +40,7 @@ class SparseLDL(NamedTuple):
         return [sum((entry * x[i] for i, entry in self.below[r].items()), x[r]) for r in range(len(x))]
 
     def solve(self, b: Sequence[Scalar], count: int | None = None) -> list[Scalar]:
-        """Return A^(-1) b, of the first `count` rows of the order; for the others zero."""
+        """Return A^(-1) b of the first `count` rows and columns of the order; the other entries of the result are zero."""
         y, rows = self.forward(b, count), self.order[:count]
         scaled = [s * inverse if r in rows else s.graph.constant(0.0) for r, (s, inverse) in enumerate(zip(y, self.inverse))]
         return self.backward(scaled, count)
@@ -49,10 +52,11 @@ def factorize(
     """Factorize a symmetric matrix in a given order, without pivoting.
 
     Args:
-        graph: The graph of its entries.
-        matrix: Its rows by column, of which the lower triangle is used.
+        graph: The graph of the entries.
+        matrix: The rows of the matrix, each by column. Only the lower triangle is read.
         order: The order of elimination.
-        invert: Returns the reciprocal of a pivot, given the index of its row, the pivot, and the diagonal entry of the row.
+        invert: Function that returns the reciprocal of a pivot, given the index of its row, the pivot, and the diagonal entry of
+            that row in `matrix`; zero leaves the row out.
 
     Returns:
         The factors.

@@ -1,4 +1,4 @@
-"""Loop programs as functions of arrays, without machine code: by NumPy, without compilation, or by JAX."""
+"""Loop programs as functions of arrays, without machine code: run by NumPy, which compiles nothing, or by JAX."""
 
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -24,7 +24,9 @@ MAX_UPDATES = 8  # number of updates of one place that JAX unrolls; more become 
 
 
 class ArrayLoops:
-    """A loop program as a function of its arrays, by NumPy or JAX; no row of a loop may read a number that another row writes.
+    """A loop program as a function of its arrays, by NumPy or JAX.
+
+    No row of a loop may read a number that another row of the same loop writes.
 
     The indices of all numbers are computed once, for all calls. By NumPy, arrays may have a second axis of many states, or of
     length one if they are the same for all.
@@ -45,10 +47,11 @@ class ArrayLoops:
         self._on_floats = FloatLoops(self._parts) if xp is np and FloatLoops.support(self._parts) else None
 
     def on_lists(self, lists: Lists) -> bool:
-        """Change the lists of the numbers of arrays by a run at one state; return False if that is not possible.
+        """Run the program at one state on Python's floats; return False if that is not possible.
 
-        It is not if loops have many rows, or a number is not finite; the lists are then of no more use. Rows may read what
-        earlier rows have written.
+        The numbers of each array are changed in place. The run is not possible if the program has too many rows or operations or
+        calls JAX, or if a number is not finite; the numbers must not be used then. Here, rows may read numbers that earlier rows
+        have written.
         """
         if self._on_floats is None:
             return False
@@ -59,9 +62,10 @@ class ArrayLoops:
         return True
 
     def is_worth_compiling(self, often: bool) -> bool:
-        """Return True once: at the call of this method after which a program that runs at single states is worth compiling.
+        """Count a run at a single state; return True if this is the run at which compiling the program pays off.
 
-        That is the first call if the runs are `often`.
+        That is the first run if many are expected (`often`). All other calls return False, and so do all calls if Python's floats
+        do not suffice for the program.
         """
         if self._calls >= WORTH_COMPILING or self._on_floats is None:
             return False
@@ -69,11 +73,16 @@ class ArrayLoops:
         return self._calls == WORTH_COMPILING
 
     def compile(self, sizes: Mapping[str, int]) -> None:
-        """Make `compiled`, if there is a compiler that supports the program; `sizes` has the lengths of all its arrays."""
+        """Set `compiled`, which stays None if no compiler supports the program.
+
+        `sizes` has the lengths of all its arrays except `constants`.
+        """
         self.compiled = compiled_loops(self._program, sizes, tuple(self._results or ()))
 
     def at_many(self, sizes: Mapping[str, int], given: Mapping[str, int]) -> CompiledAtMany | None:
-        """Return the program at many states by machine code; None until it has run so often that compiling it pays off.
+        """Return machine code of the program for many states; None until enough runs are counted for compiling it to pay off.
+
+        Each call counts as a run. The result is always None if no compiler supports the program.
 
         Args:
             sizes: the lengths of all its arrays except `constants` and those that describe a state.
@@ -140,7 +149,7 @@ def _run_by_numpy(part: LaidOutPart, arrays: dict[str, np.ndarray]) -> None:
 
 
 def _run_by_jax(part: LaidOutPart, arrays: dict[str, Array]) -> None:
-    """Run a part, with one operation for all reads from an array and one for all writes: XLA compiles each for milliseconds."""
+    """Run a part, with one operation for all reads from an array and one for all writes: compiling each takes milliseconds."""
     if not isinstance(part.run, ScalarProgram):
         for name, places, _ in part.outputs:
             x = arrays[name]
@@ -162,7 +171,7 @@ def _run_by_jax(part: LaidOutPart, arrays: dict[str, Array]) -> None:
 
 
 def _group(items: Sequence[tuple], heads: int) -> dict[tuple, list[tuple[int, tuple]]]:
-    """Group items, with their indices, by their first entries."""
+    """Group items by their first `heads` entries; each item in a group comes after its index."""
     groups: dict[tuple, list[tuple[int, tuple]]] = {}
     for k, item in enumerate(items):
         groups.setdefault(item[:heads], []).append((k, item))
@@ -177,7 +186,10 @@ def _take(x: jax.Array, places: np.ndarray) -> jax.Array:
 
 
 def _put(x: jax.Array, places: np.ndarray, new: jax.Array, update: str) -> jax.Array:
-    """Return an array with some places updated: by a gather, since XLA compiles a scatter into a loop."""
+    """Return an array whose numbers at `places`, which may repeat, are updated with the numbers `new`.
+
+    Few updates of each place are made by gathers, since XLA compiles a scatter into a loop.
+    """
     order = np.argsort(places, kind="stable")
     first = np.searchsorted(places[order], places[order])
     earlier = np.empty(len(places), int)

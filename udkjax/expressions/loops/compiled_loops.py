@@ -1,4 +1,7 @@
-"""Loop programs at states by machine code, which a folder on a higher floor makes: `native/host/state_loops.py`."""
+"""Machine code that runs loop programs at given states, made by compilers that `native/host/state_loops.py` registers here.
+
+That folder is on a higher floor, so that it cannot be imported here.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol, TypeAlias
@@ -9,13 +12,19 @@ from udkjax.expressions.loops.loop_program import LoopProgram
 
 
 class CompiledLoops(Protocol):
-    """A program as a function of the address of its constants, and of the arrays that describe a state, by name."""
+    """Machine code of a program at one state, which returns the resulting arrays by name.
+
+    Its arguments are the address in memory of the array `constants`, and the arrays that describe the state, by name.
+    """
 
     def __call__(self, constants: int, given: Mapping[str, np.ndarray | float], /) -> dict[str, Any]: ...
 
 
 class CompiledAtMany(Protocol):
-    """A program as a function of its constants, and of the arrays that describe states by name, each (n, T) or (n, 1)."""
+    """Machine code of a program at T states, which returns the resulting arrays (n, T) by name.
+
+    Its arguments are the array `constants`, and the arrays that describe the states, by name, each (n, T) or (n, 1).
+    """
 
     def __call__(self, constants: np.ndarray, given: Mapping[str, np.ndarray], /) -> dict[str, Any]: ...
 
@@ -28,17 +37,17 @@ _COMPILERS: list[tuple[LoopCompiler, CompilerAtMany]] = []
 
 
 def compile_by(compiler: LoopCompiler, at_many: CompilerAtMany) -> None:
-    """Compile programs by these functions from now on."""
+    """Register the functions that compile programs for one state and for many, in place of earlier ones."""
     _COMPILERS[:] = [(compiler, at_many)]
 
 
 def compiled_loops(program: LoopProgram, sizes: Mapping[str, int], results: Sequence[str]) -> CompiledLoops | None:
-    """Return a program by machine code; None if there is no compiler, or if it cannot hold the program."""
+    """Return machine code of a program for one state; None if there is no compiler, or if it does not support the program."""
     return _COMPILERS[0][0](program, sizes, results) if _COMPILERS else None
 
 
 def compiled_at_many(
     program: LoopProgram, sizes: Mapping[str, int], given: Mapping[str, int], results: Sequence[str]
 ) -> CompiledAtMany | None:
-    """Return a program at many states by machine code; None if there is no compiler, or if it cannot hold the program."""
+    """Return machine code of a program for many states; None if there is no compiler, or if it does not support the program."""
     return _COMPILERS[0][1](program, sizes, given, results) if _COMPILERS else None

@@ -19,7 +19,7 @@ Lists: TypeAlias = dict[str, list[Any]]  # the numbers of each array
 
 
 class LaidOutPart(NamedTuple):
-    """A part of a program with the indices of each of its numbers, one for each row of its table."""
+    """A part of a program. The indices of each number that it reads or writes are known: one for each row of its table."""
 
     run: ScalarProgram | float  # a float: the constant that part of an array is set to
     inputs: list[tuple[str, Any]]  # array ("" if unused) and indices of each
@@ -28,9 +28,9 @@ class LaidOutPart(NamedTuple):
 
 
 class FloatLoops:
-    """The parts of a program whose loops have few rows, as a function of the lists of its numbers, which it changes.
+    """A loop program of few rows or operations as a function of lists with the numbers of each array, which it changes.
 
-    Rows run one after another, so that a row may read what an earlier one has written. It raises `ArithmeticError` or
+    Rows run one after another, so that a row may read numbers that an earlier row has written. A call raises `ArithmeticError` or
     `ValueError` if a number is not finite.
     """
 
@@ -39,7 +39,7 @@ class FloatLoops:
 
     @staticmethod
     def support(parts: Sequence[LaidOutPart]) -> bool:
-        """Return True if there are few rows, and no calls of JAX."""
+        """Return True if the parts have few rows or few operations, and no operation calls JAX."""
         programs = [(part.run, part.count) for part in parts if isinstance(part.run, ScalarProgram)]
         if not all(run.is_plain for run, _ in programs):
             return False
@@ -55,7 +55,7 @@ def _has_few_rows(parts: Sequence[LaidOutPart]) -> bool:
 
 
 def _with_lists(part: LaidOutPart) -> LaidOutPart:
-    """Return a part with lists instead of arrays."""
+    """Return a part whose indices are lists instead of arrays."""
     if not isinstance(part.run, ScalarProgram):
         return part._replace(outputs=[(name, range(x.start, x.stop), update) for name, x, update in part.outputs])
     inputs = [(name, places.tolist()) for name, places in part.inputs]

@@ -30,7 +30,7 @@ class LoopDerivative:
 
     @property
     def forward(self) -> LoopProgram:
-        """The program of the tangents of all arrays, from the tangents of its inputs."""
+        """The program that computes the tangents of all arrays from those of the loops' inputs."""
         parts: list[KernelLoop | Reset] = []
         for part in self._parts:
             if isinstance(part, Reset):
@@ -42,7 +42,7 @@ class LoopDerivative:
 
     @property
     def reverse(self) -> LoopProgram:
-        """The program of the cotangents of all arrays, from the cotangents of its results."""
+        """The program that computes the cotangents of all arrays from those of the loops' results."""
         parts: list[KernelLoop | Reset] = []
         for part in reversed(self._parts):
             if isinstance(part, KernelLoop):
@@ -53,7 +53,7 @@ class LoopDerivative:
         """Return the program of the tangents of all arrays along two directions and along both: d x, e x, and d(e x).
 
         Each kernel computes the three for its results at once, so that numbers that have been read can still be added to. The
-        `settled` arrays have only second-order tangents.
+        arrays named in `settled` have no first-order tangents d x and e x: these are zero.
         """
         parts: list[KernelLoop | Reset] = []
         for part in self._parts:
@@ -107,9 +107,10 @@ Addressed = list[tuple[Scalar, Address]]
 
 
 def _active(kernel: Kernel, constant_arrays: frozenset[str]) -> tuple[Addressed, Addressed]:
-    """Return the inputs and the outputs that have derivatives.
+    """Return the inputs and the outputs of a kernel that have derivatives: those in other arrays than `constant_arrays`.
 
-    A fixed input that is computed from other inputs, such as the sine of an angle, is differentiated with respect to these.
+    An input in one of these that is computed from other inputs, such as the sine of an angle, is differentiated with respect to
+    the other inputs.
     """
     inputs, outputs = (
         zip(kernel.program.inputs, kernel.inputs, strict=True),
@@ -136,12 +137,12 @@ def _push_twice(kernel: Kernel, constant_arrays: frozenset[str], still: frozense
 
 
 def _prefixed(addressed: Addressed, prefix: str) -> Addressed:
-    """Return the addresses with a prefix to the names of their arrays."""
+    """Return scalars and addresses, with a prefix to the name of each address's array."""
     return [(s, address._replace(array=prefix + address.array)) for s, address in addressed]
 
 
 def _kernel(kernel: Kernel, seeds: Addressed, outputs: Addressed) -> Kernel | None:
-    """Return the kernel with further inputs `seeds` that writes `outputs` instead; None if there are no outputs."""
+    """Return a kernel with `seeds` as additional inputs and `outputs` in place of its outputs; None if there are no outputs."""
     if not outputs:
         return None
     inputs = list(zip(kernel.program.inputs, kernel.inputs, strict=True))

@@ -37,7 +37,7 @@ class Kernel:
 
 
 class KernelWriter:
-    """Builds a kernel: its graph, and the addresses of its inputs and outputs."""
+    """A kernel under construction: its graph, and the addresses of its inputs and outputs so far."""
 
     def __init__(self, graph: Graph | None = None):
         self.graph = Graph() if graph is None else graph
@@ -45,17 +45,17 @@ class KernelWriter:
         self._outputs: list[tuple[Scalar, Address]] = []
 
     def read(self, array: str, base: int | None, offset: int = 0) -> Scalar:
-        """Read a number from an array."""
+        """Add an input that is read from an address (see `Address`), and return it."""
         s = self.graph.input((array, base, offset), array)
         self._inputs[s] = Address(array, base, offset)
         return s
 
     def bind(self, s: Scalar, array: str, base: int | None, offset: int = 0) -> None:
-        """Read an input that is already in the graph."""
+        """Add an input that is already in the graph, to be read from an address."""
         self._inputs[s] = Address(array, base, offset)
 
     def write(self, s: Scalar, array: str, base: int | None, offset: int = 0, update: str = SET) -> None:
-        """Write a number to an array."""
+        """Add an output `s`, with which the number at an address is updated."""
         self._outputs.append((s, Address(array, base, offset, update)))
 
     def kernel(self) -> Kernel:
@@ -65,7 +65,7 @@ class KernelWriter:
 
 
 class KernelLoop(NamedTuple):
-    """A kernel, run for every row of a table of bases (elements, columns)."""
+    """A kernel that runs for every row of a table of base addresses (elements, bases)."""
 
     kernel: Kernel
     table: np.ndarray
@@ -73,12 +73,12 @@ class KernelLoop(NamedTuple):
     fixed: Collection[str] = ()  # arrays of the kernel that are constant in its derivative
 
     def array(self, name: str) -> str:
-        """Return the name in the program of an array of the kernel."""
+        """Return the name that an array has in the program, given its name in the kernel."""
         return self.names.get(name, name)
 
 
 class Reset(NamedTuple):
-    """Sets some numbers of an array to a constant."""
+    """A part of a program that sets `count` numbers of an array, from index `start` on, to a constant."""
 
     array: str
     start: int

@@ -36,10 +36,10 @@ def unroll(program: LoopProgram, arrays: Mapping[str, Mapping[int, Scalar]], gra
 
     Args:
         program: The program.
-        arrays: Its inputs by array.
+        arrays: The nonzero numbers of each array before the run, by index.
         graph: The graph of all scalars.
         linear: A group of inputs in which the program is linear, such as tangents: the coefficients of each input are added up
-            first, so that a sum has only one product for each number on which it depends.
+            first, so that a sum has only one product for each number on which it depends. None: no such group.
     """
     results: dict[str, dict[int, Scalar]] = {name: dict(x) for name, x in arrays.items()}
     joined: dict[ArrayPlace, _Joined] = {}
@@ -98,7 +98,7 @@ def unroll(program: LoopProgram, arrays: Mapping[str, Mapping[int, Scalar]], gra
 
 
 def collect(s: Scalar, group: str, atoms: Collection[int]) -> Scalar:
-    """Write a scalar as a linear combination of atoms and of inputs of a group, with one product for each."""
+    """Return a scalar, rewritten as a linear combination of nodes `atoms` and of inputs of a group, with one product for each."""
     graph, one = s.graph, s.graph.constant(1.0)
     forms: dict[int, SparseRow] = {}
 

@@ -33,7 +33,7 @@ _CUMULATIVE = {"cumsum": lax.add_p, "cumprod": lax.mul_p, "cummax": lax.max_p, "
 
 
 def join(primitive: Any, a: Scalar, b: Scalar) -> Scalar:
-    """Apply a binary primitive to two scalars; sums and products of floats are operations of the graph."""
+    """Return a binary primitive of two scalars; sums and products of floats become operations of the graph."""
     if np.issubdtype(a.node.dtype, np.floating):
         if primitive is lax.add_p:
             return a + b
@@ -43,7 +43,7 @@ def join(primitive: Any, a: Scalar, b: Scalar) -> Scalar:
 
 
 def _rows(array: np.ndarray, axes: Sequence[int]) -> np.ndarray:
-    """Return an array with some axes moved to the end and made one."""
+    """Return an array with some axes moved to the end and merged into one."""
     kept = [k for k in range(array.ndim) if k not in axes]
     return array.transpose(*kept, *axes).reshape(*(array.shape[k] for k in kept), -1)
 
@@ -86,7 +86,7 @@ def _first_extreme(compare: Any, graph: Graph, inputs: ScalarArrays, equation: A
 
 
 def _extreme(compare: Any, x: Scalar, best: Scalar) -> Scalar:
-    """Return whether x beats the best before it; the first NaN beats all numbers."""
+    """Return the condition that x beats `best`, the best element before it, by `compare`; the first NaN beats all numbers."""
     if x.node.dtype == bool:
         x, best = (where(s, s.graph.constant(1, int), s.graph.constant(0, int)) for s in (x, best))
     beats = apply(compare, bool, x, best)
@@ -100,7 +100,7 @@ def _is_nan(x: Scalar) -> Scalar:
 
 
 def _precedes(a: Sequence[Scalar], b: Sequence[Scalar]) -> Scalar:
-    """Return whether keys a sort strictly before keys b, the first key first; NaN sorts last."""
+    """Return the condition that the keys `a` sort strictly before the keys `b`, the first key first; NaN sorts last."""
     x, y = a[0], b[0]
     less = apply(lax.lt_p, bool, x, y)
     if np.issubdtype(x.node.dtype, np.floating):
@@ -134,7 +134,7 @@ def _sort(graph: Graph, inputs: ScalarArrays, equation: Any) -> list[np.ndarray]
 
 
 def _compare_totally(is_strict: bool, graph: Graph, inputs: ScalarArrays, equation: Any) -> list[np.ndarray]:
-    """Compare in the order of sorting, in which NaN comes last."""
+    """Return x < y (if `is_strict`) or x <= y of elements, in the order of sorting, in which NaN comes last."""
     arrays: ScalarArrays = list(np.broadcast_arrays(*inputs))
     a, b = arrays
     result = np.empty(a.shape, object)
@@ -145,7 +145,7 @@ def _compare_totally(is_strict: bool, graph: Graph, inputs: ScalarArrays, equati
 
 
 def choose(index: Scalar, cases: Sequence[Scalar]) -> Scalar:
-    """Return the case of an unknown index, which is clamped to the cases."""
+    """Return cases[index] for an index that is known only at run time; an index beyond the first or last case selects that."""
     if index.node.dtype == bool:
         return where(index, cases[1], cases[0])
     result = cases[-1]
@@ -155,7 +155,10 @@ def choose(index: Scalar, cases: Sequence[Scalar]) -> Scalar:
 
 
 def choose_branch(graph: Graph, index: Scalar, branches: Sequence[Callable[[], list[np.ndarray]]]) -> list[np.ndarray] | None:
-    """Return the results of the branch of an unknown index; None if one has an opaque node, which would always run."""
+    """Return the results of the branch that an index known only at run time selects, computed from those of all branches.
+
+    None if a branch contains an opaque node, which would always run.
+    """
     before = len(graph.nodes)
     results = [branch() for branch in branches]
     if any(node.kind == "call" for node in graph.nodes[before:]):
@@ -188,15 +191,15 @@ def _host_platform(graph: Graph, inputs: ScalarArrays, equation: Any) -> list[np
 def select_rows(
     select: Callable[[ScalarArrays], np.ndarray], array: np.ndarray, indices: np.ndarray, offset: Sequence[int]
 ) -> np.ndarray | None:
-    """Return the elements that a `gather` takes from an array by rows of indices, of which some are unknown.
+    """Return the elements that a `gather` takes from an array by rows of indices, some of which are known only at run time.
 
-    Each element depends on one row of indices only, and so the choices do not multiply with the rows.
+    Each element depends on one row of indices only, so that the number of cases does not grow with the number of rows.
 
     Args:
         select: Function from indices, an array of constants, to the elements.
         array: The array.
         indices: The rows of indices (..., k), as Scalars.
-        offset: The axes of the result that are no axes of the rows.
+        offset: The axes of the result along the slices that are taken; the other axes number the rows of indices.
 
     Returns:
         The elements; None if there are too many places to choose from.
@@ -231,7 +234,7 @@ def select_rows(
 
 
 def select_unknown(select: Callable[[ScalarArrays], np.ndarray], array: np.ndarray, indices: ScalarArrays) -> np.ndarray | None:
-    """Return the elements of an array at indices of which some are unknown, by `select` of known ones.
+    """Return the elements of an array at indices some of which are known only at run time: choices among known cases.
 
     Args:
         select: Function from indices, as arrays of constants, to the elements.

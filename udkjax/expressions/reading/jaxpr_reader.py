@@ -114,7 +114,10 @@ def _read(graph: Graph, jaxpr: core.Jaxpr, constants: Sequence[np.ndarray], argu
 
 
 class _Inline:
-    """Evaluates a closed jaxpr where a primitive is expected: JAX's own calls take other parameters in each of its releases."""
+    """A stand-in for a primitive that evaluates a closed jaxpr.
+
+    JAX's own primitives for calls are not used, since their parameters differ between its releases.
+    """
 
     name, multiple_results = "closed_call", True
 
@@ -126,7 +129,10 @@ _INLINE: Any = _Inline()
 
 
 def _after(graph: Graph, equation: Equation, inputs: list[np.ndarray], output: np.ndarray) -> np.ndarray:
-    """Return an output that is computed after an equation without outputs, whose effect takes place with it."""
+    """Return `output` as the result of an opaque node that also executes an equation without outputs, for its effect.
+
+    The effect, such as printing, takes place only if this output is needed.
+    """
 
     def function(output: jax.Array, *inputs: jax.Array) -> jax.Array:
         equation.primitive.bind(*inputs, **equation.params)
@@ -189,7 +195,7 @@ def _equation(graph: Graph, equation: Equation, inputs: list[np.ndarray]) -> lis
 
 
 def _write_out(graph: Graph, equation: Equation, inputs: list[np.ndarray]) -> list[np.ndarray] | None:
-    """Return the outputs of a primitive of whole arrays as operations on elements; None if there is no rule."""
+    """Return the outputs of a primitive of whole arrays as operations on elements; None if no rule applies to it."""
     name = equation.primitive.name
     if name == "cond":
         branches = [partial(_read_inner, graph, branch, inputs[1:]) for branch in equation.params["branches"]]

@@ -1,4 +1,4 @@
-"""Loops of a jaxpr, unrolled while it is read: those of a known number of turns."""
+"""Loops of a jaxpr whose number of iterations is known, unrolled while the jaxpr is read."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, TypeAlias
@@ -10,7 +10,7 @@ UNROLLED_OPERATIONS = 20_000  # maximum for an unrolled loop, over all its itera
 
 
 def unroll(read: Read, equation: Any, inputs: list[np.ndarray]) -> list[np.ndarray] | None:
-    """Unroll a `scan`, or a `while` whose condition is known in each turn; None if there are too many turns, or unknown ones."""
+    """Return the outputs of a `scan` or a `while` loop, unrolled; None if it has too many iterations, or an unknown number."""
     return (_unroll_scan if equation.primitive.name == "scan" else _unroll_while)(read, equation, inputs)
 
 

@@ -16,12 +16,15 @@ MOST_ROWS = 6  # a decomposition of n rows takes about n^3 operations
 
 
 def is_small(*arrays: np.ndarray) -> bool:
-    """Return whether the matrices in arrays are small enough to be expanded."""
+    """Return True if the matrices in arrays are small enough to be expanded."""
     return all(max(a.shape, default=0) <= MOST_ROWS for a in arrays)
 
 
 def decompose(graph: Graph, inputs: list[Any], equation: Any) -> list[np.ndarray] | None:
-    """Write out `lu`: L below the diagonal and U, the row that each row was exchanged with, and the order of the rows."""
+    """Return the outputs of `lu`, expanded; None if the matrices are too large.
+
+    The outputs are L below the diagonal and U in one array, the row with which each row was exchanged, and the order of the rows.
+    """
     matrices = inputs[0]
     *batch, m, n = matrices.shape
     if not is_small(matrices):
@@ -41,7 +44,7 @@ def decompose(graph: Graph, inputs: list[Any], equation: Any) -> list[np.ndarray
 
 
 def _largest(rows: list[list[Scalar]], k: int, number: list[Scalar]) -> Scalar:
-    """Return the first row from k on whose entry in column k is largest."""
+    """Return the number of the first row, from k on, whose entry in column k has the largest absolute value."""
     best, pivot = absolute(rows[k][k]), number[k]
     for i in range(k + 1, len(rows)):
         size = absolute(rows[i][k])
@@ -70,7 +73,10 @@ def _eliminate(rows: list[list[Scalar]], k: int, columns: int) -> None:
 
 
 def solve_triangular(graph: Graph, inputs: list[Any], equation: Any) -> list[np.ndarray] | None:
-    """Write out `triangular_solve`: A X = B, or X A = B, with A or its transpose."""
+    """Return the X of `triangular_solve`, expanded: of A X = B or X A = B, with A or its transpose.
+
+    None if A is too large, or if its numbers are not real floating-point numbers.
+    """
     A, B = inputs
     options = equation.params
     if not is_small(A) or not np.issubdtype(np.dtype(equation.outvars[0].aval.dtype), np.floating):

@@ -26,17 +26,17 @@ class ComplexScalar(NamedTuple):
         return ComplexScalar(self.re * other.re - self.im * other.im, self.re * other.im + self.im * other.re)
 
     def scaled(self, factor: Scalar) -> "ComplexScalar":
-        """Return a real multiple."""
+        """Return this number times a real factor."""
         return ComplexScalar(self.re * factor, self.im * factor)
 
     @property
     def conjugate(self) -> "ComplexScalar":
-        """The conjugate."""
+        """The complex conjugate."""
         return ComplexScalar(self.re, -self.im)
 
     @property
     def squared_modulus(self) -> Scalar:
-        """|z|^2."""
+        """The squared modulus, |z|^2."""
         return self.re * self.re + self.im * self.im
 
     def inverse(self) -> "ComplexScalar":

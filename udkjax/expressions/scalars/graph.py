@@ -108,14 +108,14 @@ class Graph:
     # --- leaves
 
     def input(self, name: Hashable, group: str, dtype: DTypeLike | None = None) -> Scalar:
-        """Add an input, identified by its group and its name.
+        """Return an input, identified by its group and its name, which is added unless the graph has it.
 
         The group is the kind of quantity, so that a program can be split by the groups that its nodes depend on.
         """
         return Scalar(self, self._node("input", (), (group, name), np.dtype(dtype or self.dtype), frozenset([group])))
 
     def constant(self, value: Any, dtype: DTypeLike | None = None) -> Scalar:
-        """Add a constant."""
+        """Return a constant; equal constants of one type are one node."""
         dtype = np.dtype(dtype or self.dtype)
         value = dtype.type(value).item()
         if dtype.kind == "f" and math.copysign(1.0, value) < 0:
@@ -205,7 +205,16 @@ class Graph:
     def call(
         self, detail: "BoundPrimitive", arguments: tuple[Scalar, ...], outputs: list[tuple[tuple[int, ...], DTypeLike]]
     ) -> list[np.ndarray]:
-        """Apply a JAX primitive to whole arrays, as one opaque node and a `pick` for each element of its results."""
+        """Apply a JAX primitive to whole arrays, as one opaque node and a `pick` for each element of its results.
+
+        Args:
+            detail: The primitive, with the shapes of its arguments.
+            arguments: The elements of all arguments, array by array.
+            outputs: The shape and the type of each result.
+
+        Returns:
+            The results as arrays of Scalars.
+        """
         index = self._operation("call", arguments, detail, np.dtype(object))
         arrays = []
         for k, (shape, dtype) in enumerate(outputs):
@@ -217,9 +226,10 @@ class Graph:
         return arrays
 
     def dependencies(self, wanted: Iterable[int], given: Collection[int] = (), group: str | None = None) -> list[int]:
-        """Return the nodes on which the `wanted` nodes depend, in order of evaluation, without `given` and its dependencies.
+        """Return the nodes from which the `wanted` nodes are computed, and these themselves, in order of evaluation.
 
-        With a `group` of inputs, return only those that depend on it.
+        The `given` nodes are left out, with all nodes that only they need. With a `group` of inputs, nodes that do not depend on
+        this group are left out, too. All nodes are given by index.
         """
         nodes, visited, stack = self.nodes, set(), list(wanted)
         while stack:
@@ -230,7 +240,10 @@ class Graph:
         return sorted(visited)
 
     def copy(self, program: "Expressions", inputs: Mapping[int, Scalar]) -> list[Scalar]:
-        """Copy a program of another graph into this one and return its outputs; its inputs, by index, are replaced by scalars."""
+        """Copy a program of another graph into this one and return its outputs.
+
+        `inputs` has the scalars of this graph that replace the inputs of the program, by the index of the input's node.
+        """
         copies = dict(inputs)
 
         def copied(a: Scalar) -> Scalar:
@@ -243,7 +256,7 @@ class Graph:
         return [copied(s) for s in program.outputs]
 
     def again(self, node: Node, arguments: Sequence[Scalar]) -> Scalar:
-        """Add the operation of a node with other arguments."""
+        """Return the result of a node's operation on other arguments."""
         match node.kind:
             case "constant":
                 return self.constant(node.detail, node.dtype)

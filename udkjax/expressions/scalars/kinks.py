@@ -3,8 +3,9 @@
 Comparisons, |x|, signs, maxima, rounding and remainders are smooth except where an argument g crosses zero or a whole number.
 Each such g has a *side*, a number: 1 or -1, the sign of g; or the whole number below it. With its sides held, an expression is
 smooth, and continues smoothly beyond the crossing. A side that is not finite leaves the operation as it was.
-The whole number below x / y is the side of a remainder of x by y, and tells the sign that the remainder has on its piece. At the
-ends of the piece it is zero, where `jnp.mod` and `//`, which ask whether it is, would otherwise take another branch.
+The side of the remainder of x by y is the whole number below x / y, from which the sign of the remainder on its piece follows.
+The remainder is zero at the ends of the piece. Since `jnp.mod` and `//` compare it with zero, the result of this comparison is
+held, too: at these ends they would otherwise take another branch.
 """
 
 from collections.abc import Collection, Sequence
@@ -27,7 +28,10 @@ _KINKED = (*_ONE_SIGNED, *_OPAQUE, "clamp", "atan2", "floor", "ceil", "round", "
 
 
 class Leaving(NamedTuple):
-    """A way to leave a smooth piece: `condition` falls through zero, and the side becomes `factor` times itself plus `shift`."""
+    """A way to leave a smooth piece: `condition` falls through zero, and a side becomes `factor` times itself plus `shift`.
+
+    `side` is the index of that side.
+    """
 
     condition: Scalar
     side: int
@@ -42,11 +46,11 @@ class Pieces(NamedTuple):
     sides: list[Scalar]  # inputs of the copies, the held side of each comparison
     ways: list[Leaving]  # conditions under which a comparison changes its side
     renewed: list[Scalar]  # the sides at a state, for comparisons whose sides are unknown or depend on others
-    has_opaque: bool  # whether a loop or a branch that is opaque, so that its kinks are unknown, depends on what moves
+    has_opaque: bool  # True if an opaque loop or branch, whose kinks are unknown, depends on inputs of the groups `moving`
 
 
 def smooth_pieces(graph: Graph, outputs: Sequence[Scalar], moving: Collection[str]) -> Pieces:
-    """Hold the sides of all comparisons of inputs of the groups `moving` in expressions."""
+    """Return copies of expressions in which the sides of comparisons that depend on inputs of the groups `moving` are held."""
     held = _Held(graph, moving)
     smooth = held.hold(outputs)
     renewal = _Renewed(graph, moving)
@@ -57,19 +61,19 @@ def smooth_pieces(graph: Graph, outputs: Sequence[Scalar], moving: Collection[st
 
 
 def may_have_kinks(graph: Graph, outputs: Sequence[Scalar]) -> bool:
-    """Return whether expressions contain operations that may have jumps or kinks, whatever moves."""
+    """Return True if expressions contain operations that may have jumps or kinks, as functions of any input."""
     nodes = (graph.nodes[i] for i in graph.dependencies([s.index for s in outputs]))
     return any(n.kind in ("apply", "call") and n.detail.primitive.name in _KINKED for n in nodes)
 
 
 def has_kinks(graph: Graph, outputs: Sequence[Scalar], moving: Collection[str]) -> bool:
-    """Return whether expressions have jumps or kinks in inputs of the groups `moving`, or may have some."""
+    """Return True if expressions have jumps or kinks as functions of inputs of the groups `moving`, or may have some."""
     pieces = smooth_pieces(graph, outputs, moving)
     return pieces.has_opaque or len(pieces.sides) > 0
 
 
 class _Held:
-    """A copy of expressions with held sides."""
+    """Copies of expressions with held sides, which `hold` makes; the sides are new inputs of the graph."""
 
     def __init__(self, graph: Graph, moving: Collection[str]):
         self.graph, self.moving = graph, frozenset(moving)
@@ -105,7 +109,7 @@ class _Held:
         return where(_compare(lax.lt_p, a[0], 0.0), -size, size)
 
     def _operation(self, node: Node, a: Sequence[Scalar]) -> Scalar | None:
-        """Return an operation with its side held; None if it has none."""
+        """Return the operation of a node on copied arguments `a`, with its side held; None if it has no side."""
         name, dtype = node.detail.primitive.name, a[0].node.dtype
         if not np.issubdtype(dtype, np.floating):
             return None
@@ -182,7 +186,7 @@ class _Held:
         return where(apply(lax.is_finite_p, bool, n), side if sign > 0 else -side, n)
 
     def _whole(self, u: Scalar) -> Scalar | None:
-        """Return the largest integer that is at most u; None if u depends on no input in the groups `moving`."""
+        """Return the side of u, the largest integer that is at most u; None if u depends on no input in the groups `moving`."""
         if not u.node.depends & self.moving:
             return None
         key = f"whole {u.sign}", u.index
@@ -195,12 +199,15 @@ class _Held:
         return self._known[key][0]
 
     def _leave(self, side: Scalar, condition: Scalar, factor: float, shift: float) -> None:
-        """Add a way to leave a piece; a side that is not held is never left."""
+        """Add a way to leave a piece by the newest side, when `condition` falls through zero; never if the side is not held."""
         held = self._either(side, self.graph.constant(1.0), condition)
         self.ways.append(Leaving(held, len(self.sides) - 1, factor, shift))
 
     def _new_side(self, g: Scalar, actual: Scalar, is_near: Scalar) -> Scalar:
-        """Return the input for a new side."""
+        """Return a new input for the side of g.
+
+        A subclass may also use `actual`, the side at the state, and `is_near`: the condition that g is near a change of its side.
+        """
         side = self.graph.input(len(self.sides), SIDE)
         self.is_nested.append(SIDE in g.node.depends)
         self.sides.append(side)
@@ -211,14 +218,14 @@ class _Held:
 
 
 class _Renewed(_Held):
-    """A copy of expressions whose sides follow from the state."""
+    """Copies of expressions whose sides follow from the state; `new_sides` are these sides."""
 
     def __init__(self, graph: Graph, moving: Collection[str]):
         super().__init__(graph, moving)
         self.new_sides: list[Scalar] = []
 
     def _new_side(self, g: Scalar, actual: Scalar, is_near: Scalar) -> Scalar:
-        """Return the side that g has; where g is zero, or depends on no other side, the given one if it is known."""
+        """Return the side of g at the state; a known side stays if g depends on no other side, or is near a change."""
         given = super()._new_side(g, actual, is_near)
         is_known = apply(lax.is_finite_p, bool, given)
         stays = both(is_known, is_near) if self.is_nested[-1] else is_known
@@ -241,7 +248,7 @@ def _keeps_sign(a: Scalar, b: Scalar | None = None) -> bool:
 
 
 def is_never_negative(s: Scalar) -> bool:
-    """Return whether an expression is a square, or another one that is seen not to be negative."""
+    """Return True if the form of an expression shows that it is never negative, as of a square; False may mean unknown."""
     node = s.node
     if node.kind == "constant":
         return s.constant >= 0

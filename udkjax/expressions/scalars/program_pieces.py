@@ -6,11 +6,11 @@ from typing import NamedTuple
 
 from udkjax.expressions.scalars.scalar_program import ScalarProgram
 
-LONGEST = 4_000  # operations of a piece; those of 2,000 run a tenth longer, and LLVM takes ten times as long for 26,000 in one
+LONGEST = 4_000  # operations of a piece; pieces of 2,000 run a tenth longer, and LLVM compiles one of 26,000 ten times as long
 
 
 class ProgramPiece(NamedTuple):
-    """A part of a program that is computed at once."""
+    """A part of a program that is compiled as one function."""
 
     order: Sequence[int]
     """The nodes that it computes, in order."""

@@ -70,7 +70,7 @@ class ScalarProgram:
         )
 
     def uses(self, scalar: Scalar) -> bool:
-        """Return True if the program uses an input."""
+        """Return True if an output depends on the input `scalar`."""
         return scalar.index in self.last_use
 
     def __call__(self, values: Sequence[Operand]) -> list[Operand]:
@@ -149,7 +149,7 @@ class ScalarProgram:
         return WrittenSteps(len(self.inputs), steps, outputs)
 
     def count(self) -> dict[str, int]:
-        """Count the operations of each kind; the sine and cosine of one angle are one."""
+        """Return the number of operations of each kind, by its name; the sine and cosine of one angle are one operation."""
         counts: dict[str, int] = {}
         for index in self.order:
             node = self.graph.nodes[index]
@@ -180,7 +180,7 @@ def frontier(graph: Graph, outputs: Sequence[Scalar], early: Callable[[Node], bo
 
 
 def operations(graph: Graph, given: Sequence[Scalar], outputs: Sequence[Scalar]) -> int:
-    """Count the nodes that must be evaluated for the outputs once `given` and its dependencies are computed.
+    """Return the number of nodes that must be evaluated for the outputs once `given` and its dependencies are computed.
 
     Args:
         graph: The graph.
@@ -255,7 +255,7 @@ def _function_of_arrays(node: Node) -> Callable:
 
 
 def _plain_function(node: Node, library: ModuleType, others: Mapping[str, Callable]) -> Callable | None:
-    """Return the operator, library function or table entry that computes a node; None if JAX must."""
+    """Return the operator, the function of `library` or the entry of `others` that computes a node; None if JAX must do so."""
     if node.kind in _OPERATORS:
         return _OPERATORS[node.kind][0]
     if node.kind == "sqrt":
@@ -296,7 +296,7 @@ def _apply(node: Node, values: list[Operand]) -> Operand:
 
 
 def _array(value: Any, dtype: Any) -> jax.Array:
-    """Return a value as an array of a type, in single precision where JAX has no other."""
+    """Return a value as a JAX array of a type; in single precision if JAX does not support double precision (x64 is off)."""
     dtype = jax.dtypes.canonicalize_dtype(dtype)
     return value if isinstance(value, jax.Array) and value.dtype == dtype else jnp.asarray(value, dtype)
 

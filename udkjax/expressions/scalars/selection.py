@@ -34,19 +34,19 @@ def maximum(a: Scalar, b: Scalar) -> Scalar:
 
 
 def where(condition: Scalar, yes: Scalar, no: Scalar) -> Scalar:
-    """Return one of two scalars."""
+    """Return `yes` if the condition holds, otherwise `no`."""
     if condition.constant is not None:
         return yes if condition.constant else no
     return yes.graph.apply(lax.select_n_p, {}, (condition, no, yes), yes.node.dtype, lambda c, n, y: y if c else n)
 
 
 def both(a: Scalar, b: Scalar) -> Scalar:
-    """Return True if two conditions hold."""
+    """Return the condition that both conditions hold."""
     return a.graph.apply(lax.and_p, {}, (a, b), bool, np.logical_and)
 
 
 def either(a: Scalar, b: Scalar) -> Scalar:
-    """Return True if one of two conditions holds."""
+    """Return the condition that at least one of two conditions holds."""
     return apply(lax.or_p, bool, a, b)
 
 
@@ -56,7 +56,7 @@ def apply(primitive: Primitive, dtype: DTypeLike, *arguments: Scalar) -> Scalar:
 
 
 def fold(primitive: Primitive, parameters: dict, values: Sequence[ArrayLike]) -> np.ndarray:
-    """Apply a primitive of JAX to known numbers: by NumPy where that is exact, since JAX compiles each operation."""
+    """Return the result of a JAX primitive for known numbers, by NumPy if that is exact: JAX would compile the operation."""
     rule = exact_rule(primitive.name)
     if rule is not None:
         found = rule(*map(np.asarray, values), **parameters)

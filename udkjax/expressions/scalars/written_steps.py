@@ -25,7 +25,10 @@ _WORTH_WRITING = 20
 
 
 def written_as(text: str, function: Callable[..., Any]) -> Callable[..., Any]:
-    """Give a function an expression of its arguments {0}, {1}, ..., which `PythonFunction.call` writes instead of a call."""
+    """Return the function, with the text of an expression of its arguments {0}, {1}, ... attached.
+
+    `PythonFunction.call` writes this expression instead of a call.
+    """
     function.text = text  # pyright: ignore[reportFunctionMemberAccess]
     return function
 
@@ -44,14 +47,14 @@ class PythonFunction:
         return f"x{self._count}"
 
     def assign(self, expression: str) -> str:
-        """Give an expression a name, and return it; the same expression has one name."""
+        """Write the assignment of an expression to a new name, and return the name; the same expression is assigned once."""
         if expression not in self._names:
             self._names[expression] = name = self.new_name()
             self.lines.append(f"{name} = {expression}")
         return self._names[expression]
 
     def call(self, function: Callable[..., Any], *arguments: str) -> str:
-        """Call a function of named values, and return the name of its result."""
+        """Write a call of a function of named values, and return the name of its result."""
         if function in _SYMBOLS:
             return self.assign(f"{arguments[0]} {_SYMBOLS[function]} {arguments[1]}")
         if function is operator.neg:
@@ -73,7 +76,7 @@ class PythonFunction:
         self.lines = lines[::-1]
 
     def compile(self) -> Callable[[Any], Any]:
-        """Return the function that the written steps define."""
+        """Return the function that the written lines define."""
         exec("\n ".join([f"def run({self._argument}):", *self.lines]), self._known)
         return self._known.pop("run")
 
@@ -112,7 +115,7 @@ class WrittenSteps:
         return text.compile()
 
     def write(self, text: PythonFunction, inputs: Sequence[str]) -> list[str]:
-        """Write the steps into a function, and return the names of the outputs."""
+        """Write the steps into the text of a function, given the names of the inputs, and return the names of the outputs."""
         names = [*inputs]
         for function, places in self._steps:
             names.append(text.call(function, *[names[k] for k in places]))

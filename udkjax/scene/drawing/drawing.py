@@ -53,8 +53,9 @@ class Drawing(AbstractDrawing):
             table with the keys of a file.
         links: The links: `Link`s, or tables of their keys.
         ground: The pins that are fixed.
-        slides: Links that slide along a line without turning on it. Like all elements below, a mapping from names, or a list;
-            each is a table with the keys of a file, such as `{"pin": "O2", "speed": 6.28}`, or from `udkjax.scene.drawing`.
+        slides: Links that slide along a line without turning on it. Like all elements below, they are given as a mapping from
+            names, or as a list. Each element is a table with the keys of a file, such as `{"link": "slider", "direction": 0}`,
+            or an instance of a class of `udkjax.scene.drawing`.
         slots: Pins that are guided by a line.
         gears: Pairs of links that mesh.
         cams: Pins that stay on the profile of a link.
@@ -71,8 +72,8 @@ class Drawing(AbstractDrawing):
         name: The name of the mechanism.
         units: Units of plain numbers, such as `{"length": "mm"}`; by default SI units and radians. A number may be a string with
             its unit, such as "60 rpm".
-        friction: Friction at pins, in slides and in slots, as the elements above.
-        screws: Screws that turn at a pin and move a slide, as the elements above.
+        friction: Friction at pins, in slides and in slots, given like the slides.
+        screws: Screws that turn at a pin and move a slide, given like the slides.
         numbers: Named numbers, which other numbers may be expressions of: with {"r": 40}, a length may be "2*r". They are plain
             numbers in the drawing's units, strings with a unit, or expressions of each other.
 
@@ -155,7 +156,7 @@ class Drawing(AbstractDrawing):
 
     @property
     def own_groups(self) -> dict[str, dict[str, Any]]:
-        """All elements by section and name as the leaves are: a number given by an expression is None, or zero if an entry."""
+        """All elements by section and name, without the values of expressions: None for a number, zero for an entry of one."""
         sections = zip((*DRAWN, *BY_HAND), self._names, self._elements, strict=True)
         return {section: dict(zip(names, elements or (), strict=True)) for section, names, elements in sections}
 
@@ -174,7 +175,7 @@ class Drawing(AbstractDrawing):
         return {name: _stored(places[name]) if name in computed else pin.position for name, pin in pins.items()}
 
     def by_coordinates(self) -> "Drawing":
-        """Return the same drawing with its pins given by coordinates; itself if they are."""
+        """Return the same drawing with all pins given by coordinates; the drawing itself if they already are."""
         places, pins = self.pins, self.groups["pin"]
         if all(isinstance(pin, Pin) for pin in pins.values()):
             return self
@@ -209,12 +210,18 @@ class Drawing(AbstractDrawing):
         return {pair: units.text(float(x), "m") for lengths in self.lengths().values() for pair, x in lengths.items()}
 
     def touching_pins(self) -> list[str]:
-        """Return the pins at which circles only touch: their places have no derivatives. Numbers are concrete."""
+        """Return the names of pins whose places have no derivatives, because circles only touch, or lengths just reach a line.
+
+        The numbers of the drawing must be concrete.
+        """
         places = places_of(self.groups["pin"])
         return [name for name, pin in self.groups["pin"].items() if pin.touches(places)]
 
     def locate_pin(self, name: str) -> tuple[str, Array] | None:
-        """Return the last link at a pin, or the ground, and the pin's position in its frame (m); None for an unknown pin."""
+        """Return the last link at a pin, or "ground" if no link has the pin, and the pin's position in that frame (m).
+
+        None for an unknown pin.
+        """
         placement = placement_of(self.groups, self.ground)
         if name not in placement.places:
             return None
@@ -223,7 +230,7 @@ class Drawing(AbstractDrawing):
 
     @property
     def polygons(self) -> list[str]:
-        """The links whose shape is a polygon: plates and outlines."""
+        """The names of the links whose shape is a polygon: plates and outlines."""
         return [name for name, link in self.links.items() if link.kind in ("plate", "outline")]
 
     def shapes(self) -> dict[str, Array]:
@@ -244,7 +251,7 @@ class Drawing(AbstractDrawing):
         return found
 
     def free_pins(self) -> dict[str, tuple[str, Array]]:
-        """Return the pins that belong to a single link, by name: the link, and the position in its frame (m)."""
+        """Return the link and the position in its frame (m) of each pin that belongs to a single link, by the pin's name."""
         placement, free = placement_of(self.groups, self.ground), {}
         for pin, position in placement.places.items():
             members = placement.members(pin)
@@ -278,14 +285,14 @@ class Drawing(AbstractDrawing):
         return {"body": bodies, "joint": joints, "driver": drivers, "force": forces}
 
     def explain(self, problem: str) -> str:
-        """Return a mistake; if it is in the body of a link, add that the body's numbers follow from the link."""
+        """Return the message about a mistake; if this is in the body of a link, add that its numbers follow from the link."""
         name = next((name for name in self.links if problem.startswith(f"body {abbreviate(name)} ")), None)
         return (
             problem if name is None else f"{problem}; it follows from the mass or density, pins and width of link {quote(name)}"
         )
 
     def with_groups(self, groups: Mapping[str, Mapping[str, Any]], gravity: Array) -> "Drawing":
-        """Return the drawing with other numbers in its elements; raise a `SceneError` if they are not valid."""
+        """Return the drawing with other numbers in its elements, and other gravity; raise a `SceneError` if any is not valid."""
         named = [(name, x.value) for name, x in groups["number"].items() if x.value is not None]
         wrong = [f"number.{name}: must be a number, not {abbreviate(x)}" for name, x in named if not is_number(x)]
         known = [(name, x) for name, x in named if is_number(x) and not is_traced(x)]
@@ -310,7 +317,10 @@ def _without_mass(groups: Mapping[str, Mapping[str, Any]]) -> tuple[str, ...]:
 
 
 def _in_order(groups: Mapping[str, Mapping[str, Any]]) -> tuple[tuple[tuple[str, ...], ...], tuple[tuple[Any, ...] | None, ...]]:
-    """Return the names and the elements of each section as tuples, None if empty: JAX would sort the keys of a dict."""
+    """Return the names and the elements of each section as tuples, since JAX would sort the keys of a dict.
+
+    Instead of an empty tuple of elements, there is None.
+    """
     sections = [groups[section] for section in (*DRAWN, *BY_HAND)]
     return tuple(map(tuple, sections)), tuple(tuple(group.values()) or None for group in sections)
 
@@ -320,7 +330,7 @@ def _stored(x: Any) -> Any:
 
 
 def _entries(section: str, group: Mapping[str, Any] | Sequence[Any] | None) -> list[SceneEntry]:
-    """Return the entries of a section; unnamed elements of a list are numbered by section."""
+    """Return the entries of a section, given as a mapping from names or as a list; elements of a list are named slide1, ..."""
     cls = (DRAWN | BY_HAND)[section]
     if isinstance(group, Mapping):
         items = list(group.items())

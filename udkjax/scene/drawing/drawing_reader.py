@@ -65,8 +65,16 @@ def read_drawing(
 ) -> DrawingElements:
     """Read the elements of a drawing and find all mistakes: in units, keys, shapes, names, connections and geometry.
 
-    Plain numbers are in `units`; messages have numbers in the units `shown`, by default the same. `numbers` maps the names of
-    numbers to their values, or to expressions.
+    Args:
+        entries: The elements as tables, or as objects.
+        ground: The names of the fixed pins.
+        gravity: The acceleration of gravity; None: 9.81 m/s^2 along -y.
+        units: The units of plain numbers.
+        shown: The units of numbers in messages; None: `units`.
+        numbers: The named numbers: values, or expressions, by name.
+
+    Returns:
+        The elements that could be read, and all mistakes.
     """
     problems = list(units.problems)
     named_numbers = units.read_numbers(numbers, problems)
@@ -156,7 +164,7 @@ def _read_element(
 
 
 def _formula(entry: SceneEntry, built: Any, expression: Expression, path: str) -> Formula | None:
-    """Return the formula of an expression in an element; None if the number is no leaf of it."""
+    """Return the formula of an expression in an element; None if the element does not store the number as it is given."""
     keys_and_places = re.findall(r"\.([^.\[\]]+)|\[(\d+)\]", expression.path.removeprefix(path))
     fields, holder = [], built
     for key in (key for key, _ in keys_and_places if key):
@@ -192,7 +200,7 @@ def placement_of(groups: Mapping[str, Mapping[str, Any]], ground: Sequence[str])
 
 
 def _velocity(pins: Mapping[str, AbstractPin], name: str) -> PointArray:
-    """Return the initial velocity of a pin (m/s); a stacked one moves as the pin below, unless its own is given."""
+    """Return the initial velocity of a pin (m/s): its own, or else that of the lowest pin of its stack, or else zero."""
     given = pins[name].velocity
     given = pins[lowest_of_stack(pins, name)].velocity if given is None else given
     return np.zeros(2) if given is None else by_numpy(given)

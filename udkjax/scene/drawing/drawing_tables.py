@@ -99,7 +99,7 @@ class _Texts:
         self.formulas = drawing.formulas
 
     def put(self, section: str, owner: str, table: dict[str, Any]) -> dict[str, Any]:
-        """Return the table of an element with the texts of its expressions."""
+        """Replace the values of expressions in the table of an element by their texts, and return the table."""
         for formula in self.formulas:
             if (formula.section, formula.owner) == (section, owner):
                 self._put(table, (*(field.removesuffix("_") for field in formula.path), *formula.at), formula.text)
@@ -113,5 +113,5 @@ class _Texts:
 
 
 def _without_empty(table: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a table without names that are not given, and choices that are not made."""
+    """Return a table without the keys whose values (), "" and False stand for names and choices that are not given."""
     return {key: value for key, value in table.items() if value not in ((), "") and value is not False}

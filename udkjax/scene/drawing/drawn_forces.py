@@ -19,10 +19,11 @@ from udkjax.wording import quote
 
 
 class Motor(DrawnElement):
-    """A motor turns the second of two links at a `pin` relative to the first, moves a `slide`, or is a cylinder `between` pins.
+    """A motor that turns a link at a `pin` or moves a `slide`, or a cylinder `between` two pins.
 
-    It prescribes a `speed` or a `motion`, or applies a `torque` at a pin, anticlockwise positive on the second link. Speed and
-    motion are relative to the drawn position; for a cylinder they refer to the distance between its pins.
+    At a pin, the second of two links turns relative to the first. A motor prescribes a `speed` or a `motion`, or applies a
+    `torque` at a pin, anticlockwise positive on the second link. Speed and motion are relative to the drawn position; for a
+    cylinder they refer to the distance between its pins.
     """
 
     pin: str | None = eqx.field(static=True, default=None, metadata=PIN)

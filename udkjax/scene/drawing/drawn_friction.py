@@ -63,7 +63,10 @@ class PinFriction(DrawnElement):
         return Parts(force=Friction(joint, **numbers))
 
     def _joint(self, layout: PinLayout) -> str | None:
-        """Return the name of the joint: that of a slide or slot, or of the revolute of the two links at a pin."""
+        """Return the name of the joint that has the friction: the slide, the slot, or the revolute of the two links at the pin.
+
+        None if the two links have no revolute of their own, since both turn on a third link at the pin.
+        """
         if self.pin is None:
             return self.slide or self.slot
         first, *others = layout.members(self.pin)

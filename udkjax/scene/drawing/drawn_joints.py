@@ -28,7 +28,7 @@ from udkjax.wording import quote
 
 
 class Slide(DrawnElement):
-    """A `link` slides along a line of another link or of the ground, without relative rotation."""
+    """A joint with which a `link` slides along a line of another link or of the ground, without relative rotation."""
 
     link: str = eqx.field(static=True, metadata=LINK)
     along: tuple[str, ...] = eqx.field(static=True, converter=given_names, default=(), metadata=PIN)  # two pins
@@ -52,7 +52,7 @@ class Slide(DrawnElement):
 
 
 class PinInSlot(DrawnElement):
-    """A `pin` is guided by a line of a link, or of the ground: through two pins, or through itself in a direction."""
+    """A joint that keeps a `pin` on a line of a link or of the ground: through two pins, or through itself in a direction."""
 
     pin: str = eqx.field(static=True, metadata=PIN)
     along: tuple[str, ...] = eqx.field(static=True, converter=given_names, default=(), metadata=PIN)  # two pins
@@ -82,7 +82,7 @@ class PinInSlot(DrawnElement):
 
 
 class GearPair(DrawnElement):
-    """Two wheels mesh, or a `belt` joins them. Their centres are the pins about which they turn on the `carrier`.
+    """Two wheels that mesh, or that a `belt` connects. Their centres are the pins about which they turn on the `carrier`.
 
     `teeth` or `radii` give the ratio. An open belt turns both wheels in the same direction, a crossed one in opposite directions;
     neither slips. A belt needs radii; a chain has teeth and a `pitch`, the length of a link.
@@ -141,7 +141,7 @@ class GearPair(DrawnElement):
 
 
 class ScrewPair(DrawnElement):
-    """A screw that turns at a `pin` moves a `slide` by its `lead` for each turn.
+    """A screw that turns at a `pin` and moves a `slide` by its `lead` for each turn.
 
     Its axis may lie in the plane; anticlockwise turns of the second link at the pin, relative to the first, move the slide along
     its direction, or against it if the lead is negative.
@@ -163,12 +163,12 @@ class ScrewPair(DrawnElement):
 
 
 class CamPair(DrawnElement):
-    """A follower, the second pin, stays on the `profile` of a cam around the first pin.
+    """A cam around the first of two `pins`, and a follower: the second pin, which stays on the cam's `profile`.
 
     The polar angle of the profile is measured from the cam's x axis: from its first pin towards its second, or the world's x axis
-    for a cam with one pin. Laws begin as drawn: those of a `LiftProfile` move a follower along its slide, if it slides on the
-    link that carries the cam; those of a `SwingProfile` turn it about its pin there. `face` is the direction of the normal of a
-    flat face, away from the cam.
+    for a cam with one pin. Laws begin in the drawn position. Those of a `LiftProfile` move the follower along its slide, if it
+    slides on the link that carries the cam; those of a `SwingProfile` turn it about its pin on this link. `face` is the direction
+    of the normal of a flat face, away from the cam.
     """
 
     pins: tuple[str, ...] = eqx.field(static=True, converter=given_names, metadata=PIN)
@@ -197,12 +197,12 @@ class CamPair(DrawnElement):
         return Parts(joint=Cam(pair, placement.points(pair, places), profile, face))
 
     def unreachable(self, placement: Placement) -> str:
-        """Return why the follower cannot follow the laws as it is guided, with the key; empty if it can."""
+        """Return a message, beginning with a key, if the follower as it is guided cannot follow the laws; "" if it can."""
         profile = self.profile
         return self._guided(profile, placement).unreachable(self.face is not None) if isinstance(profile, LawProfile) else ""
 
     def _guided(self, profile: LawProfile, placement: Placement) -> LawProfile:
-        """Return the laws; the follower's slide or pivot as drawn supplies numbers that are not given."""
+        """Return the profile with the numbers that are not given, from the drawn place of the follower and its slide or pivot."""
         cam = self._pair(placement)[0]
         centre, point = (placement.places[pin] for pin in self.pins)
         arm, numbers = point - centre, {}
@@ -230,7 +230,7 @@ class CamPair(DrawnElement):
         return [member for member in layout.members(self.pins[0]) if member != self._pair(layout)[0]]
 
     def _slide(self, layout: PinLayout) -> SlidingLink | None:
-        """Return the slide of the follower on the link that carries the cam, if there is one."""
+        """Return the slide of the follower on the link that carries the cam; None if there is no such slide."""
         pairs = [{carrier, self._pair(layout)[1]} for carrier in self._carriers(layout)]
         return next((slide for slide in layout.slides.values() if {slide.link, slide.on} in pairs), None)
 
@@ -240,6 +240,6 @@ class CamPair(DrawnElement):
         return found[0] if len(found) == 1 else None
 
     def _pair(self, layout: PinLayout) -> tuple[str, ...]:
-        """Return the links, by default the only moving link of each pin."""
+        """Return the cam and the follower: `links`, by default the only moving link at each pin."""
         moving = [[member for member in layout.members(pin) if member != GROUND] for pin in self.pins]
         return self.links or tuple(members[0] for members in moving if len(members) == 1)

@@ -101,7 +101,7 @@ class Units:
         return cls(None if drawing is None else dict(drawing.units))
 
     def read_text(self, text: str, unit: str) -> float:
-        """Return a number in an SI unit from a text with a unit, or without one, in the unit of the file.
+        """Return the number that a text gives, in the SI unit `unit`; a text without a unit is in the unit of the file.
 
         Raises:
             ValueError: it cannot be read, or its unit is missing, unknown or of another quantity.
@@ -162,7 +162,7 @@ class Units:
         return named, self.measured(named)
 
     def measured(self, named: NamedNumber) -> Measured:
-        """Return a named number in the units of the file, with the SI unit of its quantity; plain numbers have none."""
+        """Return a named number in the units of the file, with the SI unit of its quantity: "" for a number without a unit."""
         if not named.unit:
             return Measured(named.value, "")
         kind = kind_of(named.unit)
@@ -170,7 +170,7 @@ class Units:
         return Measured(named.value if factor == 1.0 else by_numpy(named.value) * factor, kind)
 
     def size_of(self, unit: str) -> float:
-        """Return the size, in an SI unit, of the unit in which expressions have their values: the file's, or the SI unit."""
+        """Return the size, in an SI unit, of the unit in which expressions have their values: the file's, by default SI's."""
         return self._factor(unit) or 1.0
 
     def _read(self, path: str, text: str, unit: str) -> object:
@@ -248,7 +248,7 @@ class Units:
         return f"{value!r} {unit}"
 
     def write_table(self, element: eqx.Module, variant: str = "", law: str = "") -> dict[str, object]:
-        """Return an element as a table from which the same numbers are read."""
+        """Return an element as a table in the units of the file, from which `convert_table` reads the same numbers."""
         cls, table = type(element), {}
         for name, value in table_of(element).items():
             if isinstance(value, eqx.Module):
@@ -324,7 +324,10 @@ def _unit(cls: type, field: str, variant: str, law: str) -> str:
 
 
 def _per_power(unit: str, power: int) -> str:
-    """Return the SI unit of a coefficient of a polynomial in time with values in `unit`; "m per rad": in an angle."""
+    """Return the SI unit of the coefficient of a power in a polynomial with values in `unit`.
+
+    The argument of the polynomial is time, or an angle or a length with the unit after " per ", as in "m per rad".
+    """
     value, _, argument = unit.partition(" per ")
     return value + ("" if power == 0 else f"/{argument or 's'}" + ("" if power == 1 else f"{power}"))
 

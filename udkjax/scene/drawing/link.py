@@ -47,7 +47,7 @@ def bar(start: PointArray, end: PointArray, width: Number) -> Shape:
 
 
 def disc(centre: PointArray, diameter: Number) -> Shape:
-    """Return a disc of a diameter (m)."""
+    """Return a disc with a centre (m) and a diameter (m)."""
     return Shape(np.pi * diameter**2 / 4, centre, diameter**2 / 8)
 
 
@@ -83,7 +83,7 @@ def twice_area(points: PointArray) -> Number:
 
 
 def _next_and_cross(points: PointArray) -> tuple[PointArray, PointArray]:
-    """Return the successor of each point, and the cross product of both."""
+    """Return the successor of each point in a polygon, and the cross product of the point and its successor."""
     following = array_namespace(points).roll(points, -1, axis=0)
     return following, points[:, 0] * following[:, 1] - following[:, 0] * points[:, 1]
 
@@ -95,16 +95,16 @@ class Link(PrintsLine):
     Without a width a link of three or more pins is a plate, the polygon of its pins in order. A link of one pin is a disc of
     diameter `width` about it. Mass, centre and inertia follow from the shape with `density` and `thickness`, or with `mass`; a
     bar of given mass without a width is a thin rod. `centre` and `inertia` may be given in addition. Positions, velocities, and
-    a motion that motors determine need no mass: without one, whatever depends on it is refused.
+    a motion that motors determine need no mass. Without a mass, everything that depends on it is refused.
 
     Args:
         pins: the names of its pins, in order.
         density: in kg/m^3.
-        width: of a bar, or the diameter of a disc (m).
+        width: width of a bar, or diameter of a disc (m).
         thickness: in m.
         mass: in kg.
-        inertia: about the centre (kg m^2).
-        centre: of mass, in world coordinates (m).
+        inertia: moment of inertia about the centre (kg m^2).
+        centre: centre of mass, in world coordinates (m).
         outline: corners of the polygon, in world coordinates (m); in files also the name of a DXF or SVG file.
         holes: corners of holes in the outline, in world coordinates (m), the same number for each; corners may be repeated.
     """
@@ -197,7 +197,7 @@ class DrawnBody(NamedTuple):
     body: Body
 
     def local(self, point: PointArray) -> tuple[Number, Number]:
-        """Return a point of the drawing in the frame of the body (m)."""
+        """Return the coordinates in the body's frame (m) of a point that is given in world coordinates (m)."""
         return self.frame.local((point[0] - self.frame.x, point[1] - self.frame.y))
 
 

@@ -42,7 +42,7 @@ def where(section: str, index: int, name: str) -> str:
 
 
 def joint_names(layout: PinLayout, pins: Sequence[str]) -> dict[str, tuple[str, str, str]]:
-    """Return the pin and the two links of each revolute, by name: a pin shared by k links has k - 1 revolutes."""
+    """Return the pin and the two links of each revolute, by the name of the revolute: a pin of k links has k - 1 revolutes."""
     joints = {}
     for pin in pins:
         first, *others = layout.members(pin) or ("",)
@@ -80,7 +80,7 @@ def layout_mistakes(layout: PinLayout, groups: DrawnGroups, ground: Sequence[str
 
 
 def _taken_names(layout: PinLayout, groups: DrawnGroups) -> Iterator[str]:
-    """Iterate over names that two elements of the mechanism would share."""
+    """Iterate over messages about names that two elements of the mechanism would share."""
     motors = groups["motor"]
     spaces = (
         ("link", "body"),
@@ -105,7 +105,7 @@ def _taken_names(layout: PinLayout, groups: DrawnGroups) -> Iterator[str]:
 
 
 def _attached(layout: PinLayout, groups: DrawnGroups) -> set[str]:
-    """Return the links that are connected to another element."""
+    """Return the names of the links that share a pin with another link or the ground, or belong to another element."""
     attached = {name for pin in groups["pin"] if len(m := layout.members(pin)) > 1 for name in m}
     for section in [section for section in groups if section not in ("pin", "link", "body")]:
         for element in groups[section].values():
@@ -163,7 +163,7 @@ def pin_mistakes(pins: Mapping[str, AbstractPin], units: Units) -> Iterator[str]
 
 
 def shape_mistakes(pins: Mapping[str, AbstractPin], links: Mapping[str, Link], guided: Collection[str] = ()) -> Iterator[str]:
-    """Iterate over implausible pins and shapes; all numbers are concrete and finite.
+    """Iterate over messages about implausible pins and shapes; all numbers are concrete and finite.
 
     Pins that are stacked, or `guided` by slots, may be at the places of other pins.
     """
@@ -189,7 +189,7 @@ def _as_points(points: Sequence[PointArray] | np.ndarray) -> np.ndarray:
 
 
 def _distances(points: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
-    """Iterate over blocks of rows of the matrix of distances, each with the index of its first row, in little memory."""
+    """Iterate over blocks of rows of the matrix of distances, each after the index of its first row, to save memory."""
     rows = max(1, NUMBERS_OF_BLOCK // max(len(points), 1))
     for first in range(0, len(points), rows):
         yield first, np.linalg.norm(points[first : first + rows, None] - points[None], axis=-1)
@@ -266,7 +266,7 @@ def _reaches(corners: np.ndarray, point: PointArray) -> bool:
 
 
 def gap_mistakes(placement: Placement, groups: DrawnGroups) -> Iterator[str]:
-    """Iterate over slots, gears and cams that do not fit as drawn; all numbers are concrete."""
+    """Iterate over messages about slots, gears and cams that do not fit as drawn; all numbers are concrete."""
     size = extent(list(placement.places.values()))
     for k, (name, slot) in enumerate(groups["slot"].items()):
         distance = _off_line(placement, slot) if slot.along else 0.0

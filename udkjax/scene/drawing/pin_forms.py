@@ -31,22 +31,28 @@ class AbstractPin(PrintsLine):
     @property
     @abstractmethod
     def references(self) -> tuple[str, ...]:
-        """The pins from which the place of this one follows."""
+        """The names of the pins from which the place of this one follows."""
 
     @abstractmethod
     def place(self, places: Places) -> PointArray:
-        """Return the world coordinates (m), given those of the pins that it refers to; NumPy or traced numbers."""
+        """Return the world coordinates (m) of the pin, given those of the pins that it refers to; NumPy or traced numbers."""
 
     def mistakes(self) -> Iterator[str]:
         """Iterate over mistakes in the form of the pin, each with its key (".key: message")."""
         yield from ()
 
     def misplacement(self, places: Places, text: Callable[[float], str]) -> str:
-        """Return why the form has no point, or an empty string; numbers are concrete, and `text` shows a length (m)."""
+        """Return a message if no point has this form, such as circles that do not meet; "" if there is one.
+
+        Numbers are concrete; `text` formats a length (m).
+        """
         return ""
 
     def touches(self, places: Places) -> bool:
-        """Return True if circles only touch, so that the place has no derivative; numbers are concrete."""
+        """Return True if circles only touch, or a length just reaches a line, so that the place has no derivative.
+
+        Numbers are concrete.
+        """
         return False
 
 
@@ -107,7 +113,7 @@ class PolarPin(AbstractPin):
 
 
 class CirclesPin(AbstractPin):
-    """The pin at given lengths from two others: of the two points where these circles meet, that on one side of the line.
+    """The pin at given lengths from two others: one of the two points where circles meet, on a given side of the line of centres.
 
     With the distance d of the pins A and B, lengths r and s, the unit vector e from A to B and n to its left, the pin is
     A + x e +- y n, where x = (d^2 + r^2 - s^2) / (2 d) and y = sqrt(r^2 - x^2). Circles that touch have the pin y = 0, which has
@@ -155,7 +161,7 @@ class CirclesPin(AbstractPin):
 
 
 class RailPin(AbstractPin):
-    """The pin at a given length from another one, on the line through the pin `on` along a vector: that of a slider.
+    """The pin at a given length from another one, on the line through the pin `on` along a vector, such as that of a slider.
 
     With the foot F of the first pin on the line, at a distance h, and the unit vector e along the line, the pin is
     F +- sqrt(length^2 - h^2) e, ahead of the foot or on its other side. A length that just reaches the line gives F, without
@@ -242,7 +248,7 @@ class StackedPin(AbstractPin):
 
 
 def lowest_of_stack(pins: Mapping[str, AbstractPin], name: str) -> str:
-    """Return the lowest pin of a stack, directly or through others; the pin itself if it is on none. Stacks have no cycles."""
+    """Return the pin on which a pin is stacked, directly or through others; the pin itself if it is not a `StackedPin`."""
     while isinstance(pin := pins[name], StackedPin):
         name = pin.stacked
     return name
@@ -254,7 +260,7 @@ def norm(vector: PointArray) -> Any:
 
 
 def _heron(d: Any, r: Any, s: Any) -> tuple[Any, Any]:
-    """Return (2 d y)^2, with the height y of the triangle of sides d, r, s over d, and whether y is zero to rounding.
+    """Return (2 d y)^2, with the height y of the triangle of sides d, r, s over d, and True if y is zero up to rounding.
 
     A product of differences of lengths loses fewer digits than the difference of their squares.
     """
@@ -263,7 +269,7 @@ def _heron(d: Any, r: Any, s: Any) -> tuple[Any, Any]:
 
 
 def _leg(length: Any, height: Any) -> tuple[Any, Any]:
-    """Return the square of the other leg of a right triangle, and whether it is zero to rounding."""
+    """Return the square of the other leg of a right triangle with hypotenuse `length`, and True if it is zero up to rounding."""
     square = (length - height) * (length + height)
     return square, abs(square) <= 2 * ROUNDING * length * length
 
@@ -287,7 +293,10 @@ def form_of(table: Mapping[str, object]) -> type[AbstractPin]:
 
 
 def pin_entries(pins: Mapping[str, Any], velocities: Mapping[str, object]) -> Iterator[SceneEntry]:
-    """Iterate over the entries of pins, each given as a pin, as a table, or by its coordinates."""
+    """Iterate over the entries of pins, each given as a pin, as a table, or by its coordinates.
+
+    `velocities` are the initial velocities, by name, of pins that are given as tables or coordinates.
+    """
     for k, (name, pin) in enumerate(pins.items()):
         if isinstance(pin, AbstractPin):
             yield SceneEntry("pin", k, name, type(pin), table_of(pin), element=pin)
@@ -306,7 +315,7 @@ def places_of(pins: Mapping[str, AbstractPin]) -> dict[str, PointArray]:
 
 
 def in_order(pins: Mapping[str, AbstractPin]) -> list[str]:
-    """Return the names of pins, each after those that it refers to; pins that cannot be reached are left out."""
+    """Return the names of pins, each after those that it refers to; pins whose references lead to a circle are left out."""
     rank, found = {name: k for k, name in enumerate(pins)}, []
     missing = {name: len(set(pin.references)) for name, pin in pins.items()}  # references that are not placed yet
     users: dict[str, list[str]] = {}
@@ -341,7 +350,7 @@ def reference_mistakes(pins: Mapping[str, AbstractPin]) -> Iterator[str]:
 
 
 def _circle_from(name: str, pins: Mapping[str, AbstractPin], reached: set[str]) -> list[str]:
-    """Return the circle of references, from its first pin, to which the first unreachable references of a pin lead."""
+    """Return the pins of the circle to which a pin leads if one follows each pin's first reference that cannot be placed."""
     path = {name: 0}
     while True:
         name = next(other for other in pins[name].references if other not in reached)

@@ -32,7 +32,7 @@ def circles(centres: Sequence[str], lengths: Sequence[Numbers | str] | Array, si
     Args:
         centres: The two other pins.
         lengths: The distances from them, in the drawing's unit of length, or strings with their unit.
-        side: On which side of the direction from the first pin to the second the new one is: "left" or "right".
+        side: The side of the new pin, seen along the direction from the first of the two pins to the second: "left" or "right".
 
     Returns:
         The pin as a table with the keys of a file.

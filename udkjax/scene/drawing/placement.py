@@ -28,7 +28,7 @@ class SlidingLink(Protocol):
 
 
 class PinLayout:
-    """Names of the links that meet at each pin."""
+    """The connections of a drawing: its links, its fixed pins and its slides, and the names of the links that meet at a pin."""
 
     def __init__(self, links: Mapping[str, Link], ground: Sequence[str], slides: Mapping[str, SlidingLink]):
         self.links, self.ground, self.slides = links, ground, slides
@@ -43,7 +43,7 @@ class PinLayout:
         return tuple(of) or self.members(pin)
 
     def ends(self, between: Sequence[str]) -> tuple[str, ...]:
-        """Return the first member of each of two pins: a force at a pin has the same effect on each of its links."""
+        """Return the first member of each of two pins: a force at a pin has the same effect on whichever link it acts."""
         return tuple(self.members(pin)[0] for pin in between)
 
     def centre(self, wheel: str, carrier: str) -> str | None:
@@ -121,7 +121,7 @@ class DrawnElement(PrintsLine):
 
     @abstractmethod
     def parts(self, placement: Placement) -> Parts:
-        """Return the parts of the mechanism that the element becomes."""
+        """Return the joint, driver or force element of the mechanism that the element becomes."""
 
     @property
     def measured_as(self) -> str:
@@ -130,7 +130,7 @@ class DrawnElement(PrintsLine):
 
     @property
     def anchors(self) -> tuple[str, ...]:
-        """The pins that the element needs; if fixed to the ground, they may have no link."""
+        """The pins that the element needs as points; if they are fixed to the ground, they may have no link. Empty by default."""
         return ()
 
 

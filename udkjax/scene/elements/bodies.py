@@ -25,11 +25,11 @@ class Body(PrintsLine):
 
     Args:
         mass: in kg, greater than zero.
-        inertia: about the centre of mass, in kg m^2, greater than zero.
-        position: of the centre of mass (m).
-        angle: of the frame, anticlockwise from the x axis (rad).
-        velocity: of the centre of mass (m/s).
-        angular_velocity: in rad/s.
+        inertia: moment of inertia about the centre of mass, in kg m^2, greater than zero.
+        position: position of the centre of mass (m).
+        angle: angle of the frame, anticlockwise from the x axis (rad).
+        velocity: velocity of the centre of mass (m/s).
+        angular_velocity: in rad/s, anticlockwise positive.
     """
 
     mass: Float[Array, ""] = eqx.field(converter=given_number, metadata=POSITIVE)  # kg, > 0
@@ -49,8 +49,8 @@ class Point(NamedTuple):
     """A point, a vector or a velocity in ground coordinates.
 
     Attributes:
-        x: in m or m/s.
-        y: in m or m/s.
+        x: component along x, in m or m/s.
+        y: component along y, in m or m/s.
     """
 
     x: Number
@@ -67,7 +67,7 @@ class Point(NamedTuple):
         """Return the length of the vector. Its derivative at the zero vector, where the length has a kink, is set to zero.
 
         Args:
-            least: Length up to which a vector counts as zero.
+            least: Length up to which a vector is treated as zero.
         """
         square = self.dot(self)
         xp, nonzero = array_namespace(square), square > least * least
@@ -175,7 +175,7 @@ def between(points: Float[Array, "2 2"] | Sequence[PlaneVector], one: Frame, two
 
 
 def stack_coordinates(vectors: Sequence[Array], numbers: Sequence[Array]) -> Float[Array, "bodies 3"]:
-    """Return vectors (2,) and numbers, those of each body, as the rows of one array."""
+    """Return one array with a row for each body: the two components of its vector, then its number."""
     concrete = not is_traced((vectors, numbers))  # NumPy is faster for many small arrays
     if concrete:
         return number(np.column_stack([np.stack([np.asarray(x) for x in vectors]), [np.asarray(x) for x in numbers]]))

@@ -17,7 +17,7 @@ from udkjax.scene.elements.joints import Joint, with_number
 
 
 class Gear(Joint):
-    """Two gear wheels mesh, their centres held by the `carrier` c (a body or the ground).
+    """Two gear wheels that mesh, with their centres held by the `carrier` c (a body or the ground).
 
     1 row (m): r1 (theta1 - theta_c) + r2 (theta2 - theta_c) - constant for external gears, which turn in opposite directions
     relative to the carrier; with -r2 for an `internal` gear, with which both turn in the same direction. The sign is the same
@@ -26,7 +26,7 @@ class Gear(Joint):
     Args:
         bodies: the names of the two wheels.
         radii: pitch radii of wheel 1 and wheel 2 (m), both greater than zero.
-        internal: whether one of the wheels is an internal gear.
+        internal: True if one of the wheels is an internal gear.
         carrier: the body that holds both centres; other joints must hold them.
     """
 
@@ -54,7 +54,7 @@ class Gear(Joint):
 
 
 class Rack(Joint):
-    """Body 2, a pinion of `radius` r centred at its centre of mass, rolls on a rack of body 1 along `axis`, to its left.
+    """A rack along `axis` on body 1, and to its left a pinion, body 2, of `radius` r about its centre of mass, which rolls on it.
 
     1 row (m): s + r (theta2 - theta1) - constant, s the displacement along `axis` of body 2's origin from body 1's: moving along
     the axis, the pinion turns clockwise. The constant is the value in the initial guess. Only rolling is constrained; another
@@ -90,7 +90,9 @@ def coordinate_of(axis: Number | None, points: Float[Array, "2 2"] | None, frame
 
 
 class Screw(Joint):
-    """A nut, body 2, slides by a `lead` along `axis` of body 1 for each turn of a screw: its axis may lie in the plane.
+    """A screw and a nut, body 2, which slides by a `lead` along `axis` of body 1 for each turn of the screw.
+
+    The screw's axis may lie in the plane.
 
     1 row (m): s - lead theta / (2 pi) - constant, s the displacement of point 2 from point 1 along the axis, theta the angle of
     the second of the `turning` bodies relative to the first. The constant is the value in the initial guess. Only the ratio is
@@ -127,14 +129,14 @@ class Screw(Joint):
         yield from mistakes_of_pair(table, "turning")
 
     def _travel(self, *frames: Frame) -> Number:
-        """Return the displacement of the nut (m) minus the travel of the screw."""
+        """Return the displacement of the nut (m) minus the displacement that belongs to the angle of the screw."""
         at = dict(zip(self.frame_names, frames, strict=True))
         slid = coordinate_of(self.axis, self.points, *(at[body] for body in self.bodies))
         return slid - self.lead * (coordinate_of(None, None, *(at[body] for body in self.turning)) / (2 * np.pi))
 
 
 class Coupling(Joint):
-    """One coordinate is a polynomial of another, each an angle or a slide between two bodies: y = c0 + c1 x + c2 x^2 + ...
+    """A coupling of two coordinates, each an angle or a slide between two bodies, by a polynomial: y = c0 + c1 x + c2 x^2 + ...
 
     1 row: y - c0 - c1 x - c2 x^2 - ..., in the unit of y: m for a slide, rad for an angle. y belongs to `bodies`, x to the
     bodies `to`. With an axis, a coordinate is the displacement of point 2 from point 1 along this axis of its first body;
@@ -180,7 +182,7 @@ class Coupling(Joint):
 
 
 def mistakes_of_pair(table: Mapping[str, object], key: str) -> Iterator[str]:
-    """Iterate over the mistakes in a second pair of bodies."""
+    """Iterate over the mistakes in the second pair of bodies of an element, which its table has under a key."""
     names = table.get(key)
     if isinstance(names, list | tuple) and (len(names) != 2 or names[0] == names[1]):
         yield f"{key}: must name two bodies"

@@ -99,7 +99,7 @@ def effort_unit(coordinate: str) -> str:
 
 
 class Driver(Constraint):
-    """Prescribe one `coordinate` of body 2 relative to body 1. 1 row: the coordinate minus motion(t).
+    """A constraint that prescribes one `coordinate` of body 2 relative to body 1. 1 row: the coordinate minus motion(t).
 
     With d the vector from point 1 to point 2, the coordinates are
         `angle`: theta2 - theta1 (rad), anticlockwise positive, not wrapped: body 1 is usually the ground or the base;

@@ -20,7 +20,10 @@ from udkjax.arrays import array_namespace, is_traced, number, optional_number
 
 
 def number_or_guess(value: Numbers | None) -> Float[Array, "..."]:
-    """Like `number`, but None stands for the value in the initial guess, which the mechanism fills in (`Constraint.complete`)."""
+    """Convert a number as `number` does; None stays None until the mechanism fills in the value in the initial guess.
+
+    The value is computed by `Constraint.complete`.
+    """
     return None if value is None else number(value)  # pyright: ignore[reportReturnType]
 
 

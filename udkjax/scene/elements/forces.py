@@ -44,7 +44,7 @@ class ForceElement(PrintsLine):
         return not type(self).__module__.startswith(f"{__package__}.")
 
     def potential(self, t: Number, *frames: Frame) -> Number | None:
-        """Return the potential energy V (J), or None; its generalized force is -dV/dq."""
+        """Return the potential energy V (J), whose generalized force is -dV/dq; None (the default): no energy."""
         return None
 
     def loads(self, t: Number, *frames: Frame) -> Sequence[Wrench] | None:
@@ -175,7 +175,7 @@ class Torque(ForceElement):
 
 
 def _load(frame: Frame, point: Float[Array, "2"], force: Point) -> Wrench:
-    """Return the load about the centre of mass of a force at a point of a body."""
+    """Return the load about the centre of mass of a force, in ground axes, at a point given in the body's frame."""
     arm = frame.vector(point)
     return force.x, force.y, arm.x * force.y - arm.y * force.x
 

@@ -82,27 +82,27 @@ class Friction(ForceElement):
 
     @property
     def rubs(self) -> bool:
-        """True if it depends on the load of its joint."""
+        """True if the friction depends on the load of its joint: it has a coefficient."""
         return self.coefficient is not None
 
     @property
     def sticks(self) -> bool:
-        """True if its law is set-valued."""
+        """True if the law is set-valued, so that the joint may stick."""
         return self.law == "set-valued"
 
     @staticmethod
     def may_stick(forces: Iterable[ForceElement]) -> bool:
-        """Return whether one of some force elements is friction with the set-valued law."""
+        """Return True if any of the given force elements is friction with the set-valued law."""
         return any(isinstance(force, Friction) and force.sticks for force in forces)
 
     @staticmethod
     def names_in(forces: Mapping[str, ForceElement]) -> tuple[str, ...]:
-        """Return the names of the friction among some force elements."""
+        """Return the names of those of the given force elements that are friction."""
         return tuple(name for name, force in forces.items() if isinstance(force, Friction))
 
     @staticmethod
     def mistakes(given: Mapping[str, object], joint: type | None) -> Iterator[str]:
-        """Iterate over the numbers that are missing or do not fit, each as "name: what is wrong".
+        """Iterate over messages about numbers that are missing or do not fit, each of the form "name: message".
 
         Args:
             given: The numbers by name.
@@ -133,7 +133,7 @@ class Friction(ForceElement):
 
     @staticmethod
     def mistakes_of_coefficients(sliding: object, static: object) -> Iterator[str]:
-        """Iterate over the mistakes in two coefficients: friction of rest is at least that of sliding, or nothing could start."""
+        """Yield a message if the static coefficient is less than the sliding one: a joint at rest could not begin to slide."""
         numbers = [float(x) for x in (sliding, static) if _is_concrete_number(x)]
         if len(numbers) == 2 and numbers[1] < numbers[0]:
             yield f"static_coefficient: must be at least the coefficient of sliding, {numbers[0]:g}, not {numbers[1]:g}"
@@ -145,7 +145,7 @@ class Friction(ForceElement):
         return couple(-self._torque_at(frame2.omega - frame1.omega))
 
     def rubbing_loads(self, joint: Joint, multipliers: Sequence[Number], t: Number, *frames: Frame) -> Sequence[Wrench]:
-        """Return the loads that depend on the load of the joint, as `loads` does.
+        """Return the loads on the joint's bodies that depend on the load of the joint, in the form of `loads`.
 
         Args:
             joint: The joint.
@@ -184,7 +184,7 @@ class Friction(ForceElement):
         return speed + axis.y * (rate.y - frame1.vy - frame1.omega * (point.x - frame1.x))
 
     def largest_force(self, joint: Joint, multipliers: Sequence[Number]) -> Number:
-        """Return the largest force (N), or torque of a revolute joint (N m), by which a joint with the set-valued law sticks.
+        """Return the largest friction force (N), or torque in a revolute joint (N m), with which the set-valued law can stick.
 
         Args:
             joint: The joint.
@@ -198,7 +198,10 @@ class Friction(ForceElement):
         return total + (self.coefficient if self.static_coefficient is None else self.static_coefficient) * size
 
     def edge_loads(self, joint: Joint, multipliers: Sequence[Number]) -> list[Number]:
-        """Return the loads (N) of a slot, or of both edges of a guide, whose magnitudes count; none in a revolute joint."""
+        """Return the signed loads (N) whose magnitudes the coefficient multiplies; an empty list for a revolute joint.
+
+        A guide with a length has two, those of its edges; a slot, or a guide without a length, has one.
+        """
         if isinstance(joint, Revolute):
             return []
         if self.length is None:
@@ -219,7 +222,10 @@ class Friction(ForceElement):
         return jnp.where(speed > 0, 1.0, jnp.where(speed < 0, -1.0, 0.0))
 
     def _torque_at(self, rate: Number) -> Number:
-        """Return the constant torque at a relative angular velocity."""
+        """Return the torque of the constant friction `torque` (N m), smoothed or set-valued, at an angular velocity (rad/s).
+
+        It has the sign of the angular velocity.
+        """
         assert self.torque is not None
         if self.sticks:
             return self.torque * self._direction(rate)

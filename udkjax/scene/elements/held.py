@@ -92,7 +92,7 @@ Sampled = Held | Spline
 
 
 def sampled_fields(elements: Sequence[eqx.Module]) -> list[tuple[int, str]]:
-    """Return index and field of the sampled numbers of elements: a `Held`, or a spline that is used only by calling it."""
+    """Return the index of the element and the field of each sampled number: a `Held`, or a spline that is only called."""
     return [
         (k, name)
         for k, e in enumerate(elements)
@@ -107,24 +107,27 @@ def _called_fields(cls: type) -> frozenset[str]:
 
 
 def row_size(x: Sampled) -> int:
-    """Return the number of entries of a row."""
+    """Return the number of entries of a row of `rows_of`."""
     return 5 if isinstance(x, Spline) else int(np.prod(x.values.shape[1:]))
 
 
 def rows_of(x: Sampled, xp: ModuleType) -> Any:
-    """Return the rows of all intervals, by NumPy or JAX."""
+    """Return the numbers of all intervals between breakpoints, one row for each (intervals, `row_size`), by NumPy or JAX."""
     if isinstance(x, Spline):
         return spline_pieces(xp.asarray(x.times), xp.asarray(x.values), xp)
     return xp.reshape(xp.asarray(x.values), (len(x.values), row_size(x)))
 
 
 def with_row(x: Sampled, row: Any) -> Any:
-    """Return the `Held` or spline of a single interval, from its row of numbers; the row may also be None or a mark."""
+    """Return a `Held` or a `SplinePiece` with a single interval, from its row of numbers.
+
+    The row may also be None or another object that stands for numbers.
+    """
     if isinstance(x, Spline):
         return make_module(SplinePiece, row=row)
     return make_module(Held, values=row.reshape(1, *x.values.shape[1:]) if hasattr(row, "reshape") else row, dt=1.0, t0=0.0)
 
 
 def row_at(x: Sampled, t: Any, xp: ModuleType) -> Any:
-    """Return the row of the interval at time t (s)."""
+    """Return the row of `rows_of` for the interval that contains time t (s)."""
     return rows_of(x, xp)[xp.searchsorted(xp.asarray(x.breakpoints, float), t, side="right")]

@@ -63,7 +63,10 @@ class Constraint(PrintsLine):
         return None
 
     def complete(self, *frames: Frame) -> Self:
-        """Return the constraint with its missing numbers computed from the frames of its bodies in the initial guess."""
+        """Return the constraint with its missing numbers computed from the frames of its bodies in the initial guess.
+
+        By default, no number is missing, and the constraint returns itself.
+        """
         return self
 
 
@@ -72,7 +75,7 @@ Completion = TypeVar("Completion", bound=Callable)
 
 
 def fills(name: str) -> Callable[[Completion], Completion]:
-    """Decorate a `complete` that only sets the number `name`: it is called only if that number is absent."""
+    """Return a decorator for methods `complete` that only set the number `name`; they are called only if it is absent."""
 
     def mark(complete: Completion) -> Completion:
         complete.fills = name  # pyright: ignore[reportFunctionMemberAccess]
@@ -90,7 +93,7 @@ class Joint(Constraint):
 
 
 class Revolute(Joint):
-    """Two points coincide. 2 rows: the x and y components, in ground axes, of point 2 minus point 1 (m).
+    """A pin joint: two points coincide. 2 rows: the x and y components, in ground axes, of point 2 minus point 1 (m).
 
     The multipliers are the x and y components of the force of body 2 on body 1 (N), in ground axes.
 
@@ -107,7 +110,7 @@ class Revolute(Joint):
 
 
 class Prismatic(Joint):
-    """Body 2 slides along a line of body 1 without relative rotation.
+    """A sliding joint: body 2 slides along a line of body 1 without relative rotation.
 
     2 rows: the distance of point 2 from the line through point 1 along `axis` (m), positive to the left of the axis, and
     theta2 - theta1 - `angle` (rad). The line and its normal turn with body 1: exchanging the bodies gives another joint.
@@ -133,7 +136,7 @@ class Prismatic(Joint):
 
 
 class Slot(Joint):
-    """A pin of body 2 slides along a line of body 1, free to turn.
+    """A pin in a slot: a point of body 2 slides along a line of body 1, and the bodies are free to turn.
 
     1 row: the distance of point 2 from the line through point 1 along `axis` (m), positive to the left of the axis. The line
     turns with body 1. The multiplier is the force of the pin on body 1 (N) along this normal.
@@ -152,7 +155,7 @@ class Slot(Joint):
 
 
 class Weld(Joint):
-    """No relative motion. 3 rows: the two of `Revolute` (m), then theta2 - theta1 - `angle` (rad).
+    """A rigid connection of two bodies. 3 rows: the two of `Revolute` (m), then theta2 - theta1 - `angle` (rad).
 
     Args:
         bodies: the names of the two bodies; "ground" is the fixed frame.
@@ -174,7 +177,7 @@ class Weld(Joint):
 
 
 class Distance(Joint):
-    """A massless rod of `length` L joins two points. 1 row: (d.d - L^2) / (2 L) (m), d the vector from point 1 to point 2.
+    """A massless rod of `length` L between two points. 1 row: (d.d - L^2) / (2 L) (m), d the vector from point 1 to point 2.
 
     At d.d = L^2 the gradient with respect to point 2 is the unit vector d / L, so that the multiplier is the force in the rod
     (N), positive in tension. The order of the bodies does not matter.
@@ -201,7 +204,7 @@ class Distance(Joint):
 
 
 class Angle(Joint):
-    """The relative angle is fixed. 1 row: theta2 - theta1 - `angle` (rad). Relative translation is free.
+    """A joint that fixes the relative angle of two bodies. 1 row: theta2 - theta1 - `angle` (rad). They may translate freely.
 
     Args:
         bodies: the names of the two bodies; "ground" is the fixed frame.
@@ -220,7 +223,7 @@ class Angle(Joint):
 
 
 class Cam(Joint):
-    """A point of a follower, body 2, stays on the closed `profile` of a cam, body 1; or a flat face of the follower touches it.
+    """A cam, body 1, and a follower, body 2: a point of the follower stays on the cam's `profile`, or a flat face touches it.
 
     1 row (m): |d| - radius, positive outside the profile, with d the vector from point 1 to point 2 in body 1's frame, and the
     profile's radius at its polar angle. With a `face`, n . d - radius, at the angle of its outward normal n in body 1's frame:
@@ -247,7 +250,7 @@ class Cam(Joint):
 
     @staticmethod
     def mistakes(table: Mapping[str, object]) -> Iterator[str]:
-        """Iterate over the numbers that a joint's profile lacks, and a drawing would find, each with its key."""
+        """Iterate over the missing numbers of a joint's `SwingProfile`, each with its key; only a drawing can supply them."""
         profile = table.get("profile")
         if isinstance(profile, SwingProfile) or (isinstance(profile, Mapping) and "swing" in profile):
             given = profile if isinstance(profile, Mapping) else vars(profile)

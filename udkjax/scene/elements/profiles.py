@@ -30,10 +30,11 @@ LawName = Literal["dwell", "cycloidal", "harmonic", "3-4-5", "4-5-6-7"]
 
 
 class AbstractProfile(PrintsLine):
-    """The closed outline of a cam, as a curve in its frame: the distance from the centre over a parameter, the turn.
+    """The closed outline of a cam in its frame, as a distance from the centre that depends on an angle, the turn.
 
-    For a point of the follower it is the distance of the point, at its polar angle; for a `flat` face it is the distance of the
-    face, at the angle of its normal. The turn is this angle, unless a subclass has another parameter.
+    If a point of the follower stays on the cam, the distance is that of the point, and the turn its polar angle. If a `flat` face
+    of the follower touches the cam, the distance is that of the face, and the turn the angle of its normal. In a `LawProfile`,
+    the turn is the angle by which the cam has turned.
     """
 
     @abstractmethod
@@ -53,7 +54,10 @@ class AbstractProfile(PrintsLine):
         return turn
 
     def rim(self, count: int, flat: bool = False) -> Float[np.ndarray, "count 2"]:
-        """Return places (m) of the follower's point around the centre, or of the envelope of the positions of a flat face."""
+        """Return `count` points (m) of the outline in the cam's frame: places of the follower's point.
+
+        For a `flat` face they are points of the envelope of its positions.
+        """
 
         def contact(turn: Array) -> Array:
             return jnp.stack([self(turn, flat), self.bearing(turn, flat)])
@@ -137,7 +141,7 @@ class LawProfile(AbstractProfile):
         angle: the angles of the cam (rad), which add up to a turn.
         start: direction of the slide, or from the centre to the pivot, in the cam's frame when the first law begins (rad); in a
             drawing by default as drawn, else zero.
-        clockwise: whether the cam turns clockwise.
+        clockwise: True if the cam turns clockwise.
     """
 
     base: Float[Array, ""] = eqx.field(converter=given_number, metadata=POSITIVE)  # m
@@ -149,15 +153,15 @@ class LawProfile(AbstractProfile):
 
     @abstractmethod
     def distance(self, travel: Number, flat: bool) -> Number:
-        """Return the distance (m) of the follower from the centre at a travel from the base circle."""
+        """Return the distance (m) of the follower from the centre when its travel from the base circle is `travel` (m or rad)."""
 
     @abstractmethod
     def sight(self, distance: Number, flat: bool) -> Number:
-        """Return the angle (rad) of the follower at a distance (m) from the direction of its slide or pivot."""
+        """Return the angle (rad) of a follower at a distance (m), seen from the centre, relative to its slide or pivot."""
 
     @abstractmethod
     def unreachable(self, flat: bool) -> str:
-        """Return why the follower cannot be on the base circle or at its highest place, with its key; empty if it can."""
+        """Return a message, with its key, if the follower cannot be on the base circle or at its highest place; "" if it can."""
 
     def __call__(self, turn: Number, flat: bool = False) -> Number:
         """Return the distance (m) of the point, or of the flat face, when the cam has turned by this angle (rad)."""
@@ -175,7 +179,7 @@ class LawProfile(AbstractProfile):
         return count_knots(wrap(turn, 0.0, 2 * jnp.pi), jnp.cumsum(self.angle)[:-1])
 
     def turn(self, distance: Number, angle: Number, flat: bool = False) -> Number:
-        """Return by how much the cam has turned (rad) when its follower is at this distance (m) and angle (rad)."""
+        """Return the angle (rad) by which the cam has turned when its follower is at this distance (m) and angle (rad)."""
         clockwise = angle - self._start - self.sight(distance, flat)
         return clockwise if self.clockwise else -clockwise
 
@@ -214,7 +218,7 @@ class LiftProfile(LawProfile):
     step_field = "lift"
 
     def distance(self, travel: Number, flat: bool) -> Number:
-        """Return the distance (m) from the centre at a lift (m)."""
+        """Return the distance (m) of the follower from the centre at a lift (m)."""
         if flat or self.eccentricity is None:
             return self.base + travel
         e = self.eccentricity
@@ -222,13 +226,13 @@ class LiftProfile(LawProfile):
         return jnp.sqrt(e**2 + way**2)
 
     def sight(self, distance: Number, flat: bool) -> Number:
-        """Return the angle (rad) of the follower at a distance (m) from the direction of its slide."""
+        """Return the angle (rad) from the direction of the slide to that of a follower at a distance (m) from the centre."""
         if flat or self.eccentricity is None:
             return 0.0
         return jnp.arctan2(self.eccentricity, _root((distance - self.eccentricity) * (distance + self.eccentricity)))
 
     def unreachable(self, flat: bool) -> str:
-        """Return that the line of the follower passes the base circle; empty if it meets it."""
+        """Return a message if the base circle does not reach the line of the follower; "" if it does."""
         if flat or self.eccentricity is None or float(self.base) > abs(float(self.eccentricity)):
             return ""
         off = abs(float(self.eccentricity))
@@ -257,7 +261,7 @@ class SwingProfile(LawProfile):
     step_field = "swing"
 
     def distance(self, travel: Number, flat: bool) -> Number:
-        """Return the distance (m) from the centre at a swing (rad)."""
+        """Return the distance (m) of the follower from the centre at a swing (rad)."""
         c, arm, base = self._lengths
         if flat:
             return arm + c * jnp.cos(_angle(base - arm, c) - travel)
@@ -265,14 +269,14 @@ class SwingProfile(LawProfile):
         return jnp.sqrt(c**2 + arm**2 - 2 * c * arm * jnp.cos(at_base + travel))
 
     def sight(self, distance: Number, flat: bool) -> Number:
-        """Return the angle (rad) of the follower at a distance (m) from the direction of its pivot."""
+        """Return the angle (rad) from the direction of the pivot to that of a follower at a distance (m) from the centre."""
         assert self.pivot is not None
         c, arm, _ = self._lengths
         angle = _angle(distance - arm, c) if flat else jnp.arctan2(_root(_area(distance, c, arm)), c**2 + distance**2 - arm**2)
         return jnp.where(self.pivot >= 0, angle, -angle)
 
     def unreachable(self, flat: bool) -> str:
-        """Return that the follower does not reach the base circle, or turns beyond its dead position; empty otherwise."""
+        """Return a message if the follower does not reach the base circle, or turns beyond its dead position; otherwise ""."""
         c, arm, base = (float(x) for x in self._lengths)
         low, high = (arm - c, arm + c) if flat else (abs(c - arm), c + arm)
         if not low < base < high:
@@ -292,7 +296,7 @@ class SwingProfile(LawProfile):
 
 
 def _root(x: Number) -> Array:
-    """Return the square root, and zero with zero derivatives for a negative number, as trials of an assembly may have it."""
+    """Return the square root; zero, with zero derivatives, for a negative number, as trial positions of an assembly may give."""
     return jnp.where(x > 0.0, jnp.sqrt(jnp.where(x > 0.0, x, 1.0)), 0.0)
 
 

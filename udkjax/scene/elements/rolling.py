@@ -16,7 +16,7 @@ from udkjax.scene.elements.joints import Joint
 
 
 class RollingJoint(Joint):
-    """Rows A(t, q) v = 0 that restrict velocities and no positions. A subclass defines `rates`.
+    """A joint with rows A(t, q) v = 0, which restrict velocities and no positions. A subclass defines `rates`.
 
     In the equations A takes the place of Psi_q, and A v that of Psi_dot; Psi is zero. No function of positions has these rates:
     after a tour, a sleigh may stand at any place.
@@ -32,13 +32,13 @@ class RollingJoint(Joint):
 
 
 def rolling_joints(mechanism: Any) -> list[str]:
-    """Return the names of the rolling joints of a mechanism; empty for anything else."""
+    """Return the names of the rolling joints of a mechanism; an empty list for any other model."""
     joints = getattr(mechanism, "joints", {})
     return [name for name, joint in joints.items() if isinstance(joint, RollingJoint)]
 
 
 class KnifeEdge(RollingJoint):
-    """A point of body 2 does not move across an edge: the runner of a sleigh, a skate, a wheel that rolls without resistance.
+    """An edge of body 2 that cannot move sideways: the runner of a sleigh, a skate, a wheel that rolls without resistance.
 
     1 row (m/s): the velocity of the point relative to body 1, across `axis`, positive to the left. The multiplier is the force of
     the edge on body 1 (N) along this normal.
@@ -57,7 +57,7 @@ class KnifeEdge(RollingJoint):
 
 
 class Wheel(RollingJoint):
-    """A wheel of body 2 rolls without slip, in any direction of its plane.
+    """A wheel of body 2 that rolls without slip on the plane.
 
     2 rows (m/s): the row of a `KnifeEdge`; and the velocity of the point along `axis`, relative to body 1, minus `radius` times
     the angular velocity of the second of the `turning` bodies relative to the first. The axle lies in the plane: let the body of
@@ -68,7 +68,7 @@ class Wheel(RollingJoint):
         point: the wheel, in the frame of body 2 (m).
         axis: the direction in which the wheel rolls, in body 2's frame, as an angle (rad) or a vector.
         turning: the names of the two bodies whose relative angle is that of the wheel.
-        radius: of the wheel (m), greater than zero.
+        radius: radius of the wheel (m), greater than zero.
     """
 
     point: Float[Array, "2"] = eqx.field(converter=given_number)

@@ -8,7 +8,7 @@ s = x - x_i,
 and S' is continuous where h_i-1 m_i-1 + 2 (h_i-1 + h_i) m_i + h_i m_i+1 = 6 (y_i+1 - y_i) / h_i - 6 (y_i - y_i-1) / h_i-1.
 Source: de Boor, A Practical Guide to Splines, chapter 4.
 
-They use only arithmetic, selections and loops of fixed length, so that they can become machine code.
+The functions of this module use only arithmetic, selections and loops of fixed length, so that they can become machine code.
 """
 
 from types import ModuleType
@@ -71,7 +71,7 @@ def wrap(x: Number, start: Number, period: Number) -> Array:
 
 
 def count_knots(x: Number, knots: Float[Array, " n"]) -> Array:
-    """Count the knots up to x."""
+    """Return the number of knots that are at most x, as a float."""
     return jnp.sum(jnp.where(x >= knots, 1.0, 0.0))
 
 
@@ -92,7 +92,7 @@ def _evaluate(x: Number, pieces: Float[Array, "pieces 5"]) -> Array:
 
 
 def _tridiagonal_by_numpy(diagonal: np.ndarray, off_diagonal: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Solve as `_tridiagonal`, for one column, with Python floats: nothing is compiled for each length."""
+    """Solve as `_tridiagonal` does, for a single column, by Python floats: nothing has to be compiled for each length."""
     pivots, solution, links = diagonal.tolist(), right[:, 0].tolist(), off_diagonal.tolist()
     for k, link in enumerate(links):
         factor = link / pivots[k]

@@ -151,7 +151,10 @@ def draw_on_pose(
     name: str,
     **more: Any,
 ) -> Mechanism:
-    """Return a `Drawing` of links through pins at places(s), {name: position}, whose velocities follow from the rate of s."""
+    """Return the mechanism of a drawing of links through pins at places(s), {name: position}.
+
+    Velocities of the pins follow from the rate of s; `more` are further arguments of `Drawing`.
+    """
     pins, velocities = derivative(places, as_array(s), rate)
     drawing = Drawing(pins, links, ground, velocities=velocities, gravity=gravity_vector(gravity), name=name, **more)
     return drawing.mechanism()

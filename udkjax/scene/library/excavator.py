@@ -126,5 +126,5 @@ def _world_point(body_pose, local):
 
 
 def _pose_from_point(local, point, angle):
-    """Return position and angle of a body, given the position of one of its points."""
+    """Return the position of a body's centre of mass and its angle, given its angle and the position of one of its points."""
     return point - as_array(Frame.at((0.0, 0.0), angle).vector(local)), angle

@@ -34,9 +34,9 @@ def parallelogram(
 
     `length` (m) is the length of the links, and `spacing` (m) the distance of neighbouring pivots, on the ground and on the
     coupler: a parallelogram of another size needs both. Ground pivots are at (0, 0), (spacing, 0), (2 spacing, 0); `angle` and
-    `angular_velocity` are those of the links. Bodies link1, link2, link3, coupler; rows A1, A2, A3 (link minus ground), then B1,
-    B2, B3 (link minus coupler). The paper does not print the initial state: release from rest at -45 degrees is inferred from
-    its tables.
+    `angular_velocity` are those of the links. The bodies are link1, link2, link3 and coupler. The rows are those of A1, A2, A3
+    (link minus ground), then of B1, B2, B3 (link minus coupler). The paper does not print the initial state: release from rest
+    at -45 degrees is inferred from its tables.
     """
 
     across = spacing * np.array([1.0, 0.0])
@@ -64,8 +64,9 @@ def n_four_bar(
 ) -> Mechanism:
     """Return the IFToMM benchmark A02: n square four-bars in a row, which pass through singular configurations twice a turn.
 
-    n + 1 links link0, ... on pivots (i, 0) at a common `angle`, n couplers coupler0, ...: uniform rods of 1 m and 1 kg. Rows:
-    A0, ... (links on the ground), then per coupler Bi (its left end on link i) and Ci (its right end on link i + 1).
+    There are n + 1 links, link0, ..., on pivots (i, 0) at a common `angle`, and n couplers, coupler0, ...; all are uniform rods
+    of 1 m and 1 kg. The rows are those of A0, ... (links on the ground), then, for each coupler, of Bi (its left end on link i)
+    and Ci (its right end on link i + 1).
     """
 
     def pose(s):

@@ -117,9 +117,10 @@ def chain(
     mass: Annotated[NumberLike, POSITIVE] = 1.0,
     gravity: NumberLike = 9.81,
 ) -> Mechanism:
-    """Return n uniform rods in a chain of `length` and `mass`, suspended at one end: an n-fold pendulum.
+    """Return a chain of n uniform rods, suspended at one end: an n-fold pendulum.
 
-    Bodies link0, ... from the top, all at the same `angle` from the downward vertical; joints pin0 (on the ground), pin1, ...
+    `length` and `mass` are those of the whole chain. The bodies, from the top, are link0, ..., all at the same `angle` from the
+    downward vertical; the joints are pin0 (on the ground), pin1, ...
     """
     half = 0.5 * length / n
 

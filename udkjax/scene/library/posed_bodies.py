@@ -1,8 +1,8 @@
 """Poses, and bodies that move with them, for the mechanisms of the library.
 
 Each mechanism starts closed, with velocities that satisfy its constraints: its pose q(s) is a function of one coordinate s, and
-the velocity is the derivative of the pose times the rate of s. It is computed by NumPy, without compiling anything, or by JAX if
-a number of the pose is traced. Therefore poses use the functions of `array_namespace` of their numbers.
+the velocity is the derivative of the pose times the rate of s. The derivative is computed by NumPy, without compiling anything,
+or by JAX if a number of the pose is traced. Therefore poses use the functions of `array_namespace` of their numbers.
 """
 
 from collections.abc import Callable, Sequence
@@ -30,7 +30,7 @@ COMPLEX_STEP = 1e-100  # the square is negligible relative to 1, and products wi
 
 
 def with_concrete_numbers(build: Callable[P, Mechanism]) -> Callable[P, Mechanism]:
-    """Decorate a function of the library: its arguments are checked, and numbers that are not traced arrive as NumPy arrays."""
+    """Return a function of the library that checks its arguments and passes numbers that are not traced as NumPy arrays."""
     parameters, build_deferred = signature(build), deferred(build, keeps_concrete=True)
 
     @wraps(build)
@@ -50,7 +50,9 @@ def _as_concrete(value: ArrayLike) -> ArrayLike:
 
 
 def derivative(function: Callable[..., PyTree], s: ArrayLike, rate: OneOrMore) -> tuple[PyTree, PyTree]:
-    """Return a function of s and its derivative for a rate of s, exact up to rounding: by JAX, or by a complex step in NumPy.
+    """Return the value of a function at s, and its rate of change for a given rate of s.
+
+    The rate is exact up to rounding. It is computed by JAX if a number is traced, otherwise by a complex step in NumPy.
 
     Source: Squire and Trapp, Using complex variables to estimate derivatives of real functions, SIAM Review 40, 1998.
     """
@@ -68,24 +70,27 @@ def derivative(function: Callable[..., PyTree], s: ArrayLike, rate: OneOrMore) -
 def bodies_on_pose(
     names: Sequence[str], physics: Sequence[tuple], pose: Callable, s: OneOrMore, rate: OneOrMore
 ) -> dict[str, Body]:
-    """Make bodies from their (mass, inertia), at pose(s) = [(position, angle), ...], with velocities from the rate of s."""
+    """Return bodies by name at the poses pose(s) = [(position, angle), ...], with velocities that follow from the rate of s.
+
+    `physics` has the mass and the inertia of each.
+    """
     poses, rates = derivative(pose, as_array(s), rate)
     bodies = zip(names, physics, poses, rates, strict=True)
     return {name: Body(mass, inertia, *body_pose, *body_rate) for name, (mass, inertia), body_pose, body_rate in bodies}
 
 
 def as_array(numbers: OneOrMore) -> Array | np.ndarray:
-    """Make an array of one number or several: a JAX array if one is traced, else a NumPy array."""
+    """Return an array of one number or several: a JAX array if any of them is one, otherwise a NumPy array."""
     return array_namespace(numbers).asarray(numbers)
 
 
 def uniform_rod(mass, length) -> tuple:
-    """Return mass and inertia of a uniform rod."""
+    """Return the mass, and the moment of inertia about the centre, of a uniform rod."""
     return mass, mass * length**2 / 12
 
 
 def uniform_disc(mass, radius) -> tuple:
-    """Return mass and inertia of a uniform disc."""
+    """Return the mass, and the moment of inertia about the centre, of a uniform disc."""
     return mass, mass * radius**2 / 2
 
 
@@ -96,7 +101,7 @@ def unit_vector(angle):
 
 
 def bar_pose(start, end):
-    """Return position and angle of a bar between two points."""
+    """Return the position of the centre, and the angle, of a bar between two points."""
     return 0.5 * (start + end), _angle_of(end - start)
 
 
@@ -109,7 +114,10 @@ def _angle_of(vector):
 
 
 def hanging_rod_pose(pivot, length, angle):
-    """Return position and angle of a rod that hangs from a point, at an angle to the vertical."""
+    """Return the position of the centre, and the angle from the x axis, of a rod that hangs from a pivot.
+
+    `angle` is measured from the downward vertical.
+    """
     xp = array_namespace(angle)
     return pivot + 0.5 * length * as_array([xp.sin(angle), -xp.cos(angle)]), angle - np.pi / 2
 
@@ -129,5 +137,5 @@ def apex(start, end, a, b):
 
 
 def gravity_vector(gravity: ArrayLike) -> Float[Array, "2"]:
-    """Return the acceleration of gravity along -y."""
+    """Return the acceleration of gravity as a vector along -y, from its magnitude."""
     return number([0.0, 0.0 - gravity])

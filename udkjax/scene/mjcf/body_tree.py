@@ -37,7 +37,7 @@ class TreeGeom(NamedTuple):
 
 
 def unique_name(name: str, taken: Container[str]) -> str:
-    """Return a name, with a number appended if it is taken."""
+    """Return a name, with a number appended ("arm-2") if it is taken."""
     return next(candidate for k in count(1) if (candidate := name if k == 1 else f"{name}-{k}") not in taken)
 
 
@@ -77,18 +77,21 @@ class BodyTree:
         self.hosts = self._hosts()
 
     def index_of(self, read: AttributeReader, attribute: str, default: str = "world") -> int:
-        """Return the index of the body that an attribute names."""
+        """Return the index of the body that an attribute names; for an unknown name, refuse the attribute and return 0."""
         return self.find(read, attribute, self._index, "body", default) or 0
 
     def find(self, read: AttributeReader, attribute: str, known: dict, what: str, default: str = ""):
-        """Return the object that an attribute names; if it does not exist, refuse the attribute and return None."""
+        """Return the object in `known` whose name an attribute gives; if there is none, refuse the attribute and return None.
+
+        `what` is the noun for such objects in messages.
+        """
         name = read.text(attribute, default)
         if name not in known:
             read.refuse(f"{attribute}={quote(name)}: no {what} has this name{suggestion(name, known)}")
         return known.get(name)
 
     def masses_of(self, host: int) -> list[SpaceMass]:
-        """Return the masses of a body and of the bodies fixed to it."""
+        """Return the masses of the body with index `host` and of the bodies fixed to it."""
         chosen, (low, high) = self.settings.mass_from_geoms, self.settings.mass_groups
         masses: list[SpaceMass] = []
         for body in (body for k, body in enumerate(self.bodies) if k and self.hosts[k] == host):

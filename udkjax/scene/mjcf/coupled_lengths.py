@@ -28,7 +28,10 @@ class CoupledLength(NamedTuple):
 
 
 class BodyCoordinate(NamedTuple):
-    """A joint coordinate, less its value in the file, as `factor` times a relative angle or displacement of two bodies."""
+    """A joint coordinate as a coordinate of two bodies: a relative angle, or a displacement along an axis.
+
+    The change of the joint coordinate from its value in the file is `factor` times that of the coordinate from `start`.
+    """
 
     bodies: tuple[int, int]
     start: float  # rad or m, the relative angle or displacement in the position of the file
@@ -38,7 +41,7 @@ class BodyCoordinate(NamedTuple):
 
 
 class CoupledLengths:
-    """The coordinates of `joints` and `tendons` by name; None if refused."""
+    """The coordinates of `joints` and `tendons` by name; None for a tendon that was refused."""
 
     def __init__(self, root: XmlElement, model: PlaneModel):
         self.model, self.settings = model, model.tree.settings
@@ -102,7 +105,7 @@ class CoupledLengths:
         return Ends((hosts[body1], hosts[body2]), (self.model.plane.flat(frame1.origin), self.model.plane.flat(frame2.origin)))
 
     def between_bodies(self, length: CoupledLength) -> BodyCoordinate | None:
-        """Return a joint coordinate as one of two bodies; None if it is not a relative angle, or a displacement along an axis."""
+        """Return a joint coordinate as a coordinate of two bodies; None if it is neither a relative angle nor a displacement."""
         if length.slide is not None:
             return self._slide_between_bodies(length.slide)
         if len(length.angles) != 2 or min(length.angles) < 0:
@@ -126,7 +129,7 @@ class CoupledLengths:
         return BodyCoordinate(bodies, 0.0, 1.0, model.direction(bodies[0], axis), points)
 
     def sum_lengths(self, terms: list[tuple[CoupledLength, float]], read: AttributeReader) -> CoupledLength | None:
-        """Return a weighted sum of coordinates; if slides are among them, refuse it and return None."""
+        """Return a weighted sum of coordinates; refuse it and return None if it couples slides, or a body with two hinges."""
         if not all(term.angles for term, _ in terms):
             if len(terms) == 1 and terms[0][1] == 1.0:
                 return terms[0][0]

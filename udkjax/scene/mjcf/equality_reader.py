@@ -17,9 +17,9 @@ MESHED = 1e-9  # rad, times the largest factor: rounding error of the angles of 
 
 
 class EqualityReader:
-    """The joints that represent the equalities of a model, `joints` by name; `taken` are the names of its other joints.
+    """A reader of the equalities of a model, whose attribute `joints` has the joints that represent them, by name.
 
-    `motions` are the motions of bodies in the initial state.
+    `motions` are the motions of bodies in the initial state; `taken` are the names of the other joints of the mechanism.
     """
 
     def __init__(self, root: XmlElement, lengths: CoupledLengths, motions: Mapping[int, PlaneMotion], taken: list[str]):
@@ -52,7 +52,10 @@ class EqualityReader:
         self._put_joint(read, ends, Weld(*self.model.attached(ends), angle))
 
     def _attachment(self, read: AttributeReader, anchored: str) -> tuple[Ends, np.ndarray]:
-        """Return the points that an equality joins, and the rotation (3, 3) of body 2 from its position in the file."""
+        """Return the points that an equality joins, and the rotation (3, 3) of body 2 from its position in the file.
+
+        `anchored` is the body in whose frame MJCF gives the anchor: "body1" or "body2".
+        """
         tree, rotation = self.model.tree, np.eye(3)
         if "site1" in read or "site2" in read:
             located = [tree.find(read, f"site{k}", tree.sites, "site") or (0, tree.bodies[0].frame) for k in (1, 2)]
@@ -94,9 +97,9 @@ class EqualityReader:
     def _couple(
         self, read: AttributeReader, length1: CoupledLength, length2: CoupledLength | None, polynomial: np.ndarray
     ) -> None:
-        """Add the joint that makes one joint coordinate a polynomial of another, both less their values in the file.
+        """Add the joint that makes one joint coordinate a polynomial of another, both relative to their values in the file.
 
-        Without a second length, the polynomial is its constant alone.
+        Without a second joint coordinate, only the constant of the polynomial is used.
         """
         y = self.lengths.between_bodies(length1)
         x = y if length2 is None else self.lengths.between_bodies(length2)  # of a constant, x may be any coordinate

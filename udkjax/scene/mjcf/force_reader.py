@@ -20,7 +20,10 @@ FAR_AWAY = 16.0
 
 
 class LinearForce(NamedTuple):
-    """The force -stiffness (length - at_rest) - damping rate + constant along a coordinate; `constant` is None without motor."""
+    """The force -stiffness (length - at_rest) - damping rate + constant along a coordinate.
+
+    Without a motor, `constant` is None.
+    """
 
     stiffness: float = 0.0
     damping: float = 0.0
@@ -29,7 +32,7 @@ class LinearForce(NamedTuple):
 
 
 class ForceReader:
-    """The force elements of a model, `forces`, by name."""
+    """A reader of springs, dampers and actuators of a model, whose attribute `forces` has the force elements by name."""
 
     def __init__(self, root: XmlElement, lengths: CoupledLengths, controls: Mapping[str, float], leave_out: Collection[str]):
         self.lengths, self.model, self.settings, self.leave_out = lengths, lengths.model, lengths.settings, leave_out

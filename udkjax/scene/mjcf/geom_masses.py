@@ -20,7 +20,7 @@ class SpaceMass(NamedTuple):
     inertia: np.ndarray  # (3, 3) kg m^2 about the centre, in world axes
 
     def about(self, axis: np.ndarray, point: np.ndarray) -> float:
-        """Return the moment of inertia (kg m^2) about a line through a point along a unit axis."""
+        """Return the moment of inertia (kg m^2) about the line through a point (m) in the direction of a unit vector `axis`."""
         arm = self.centre - point
         return float(axis @ self.inertia @ axis + self.mass * (arm @ arm - (arm @ axis) ** 2))
 
@@ -59,7 +59,7 @@ def geom_shape(read: AttributeReader, frame: SpaceFrame) -> tuple[str, np.ndarra
 
 
 def geom_mass(read: AttributeReader, kind: str, size: np.ndarray, frame: SpaceFrame) -> SpaceMass | None:
-    """Return the mass of a geom of a kind, with sizes (m) and frame in the world; None if it is massless."""
+    """Return the mass of a geom with a kind, sizes (m) and a frame in the world, as from `geom_shape`; None if it is massless."""
     if "mass" in read and not read.number("mass"):
         return None
     if kind not in SHAPES:

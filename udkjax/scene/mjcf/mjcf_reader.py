@@ -30,7 +30,7 @@ ROTOR_MASS = 0.01  # mass of a rotor relative to the body that carries it
 
 
 class MjcfWarning(UserWarning):
-    """An MJCF model may not behave as intended: loops are open, or contacts are ignored."""
+    """A warning that an MJCF model may not behave as intended: loops are open, or contacts are ignored."""
 
 
 def read_mjcf(source: str | os.PathLike[str], leave_out: Collection[str] = (), key: str | None = None) -> Mechanism:
@@ -65,7 +65,10 @@ def read_mjcf(source: str | os.PathLike[str], leave_out: Collection[str] = (), k
 def mechanism_of_text(
     text: str, source: str, leave_out: Collection[str] = (), key: str | None = None, stacklevel: int = 3
 ) -> Mechanism:
-    """Return the mechanism of the text of a model, as `read_mjcf`; warnings point to the caller `stacklevel` levels up."""
+    """Return the mechanism of the text of a model, as `read_mjcf` does.
+
+    `source` is the path of the file, or "" for a text without one. Warnings point to the caller `stacklevel` levels up.
+    """
     root = parse_xml(text, source)
     problems = unknown_parts(root)
     unknown_count = len(problems)
@@ -107,7 +110,10 @@ def mechanism_of_text(
 
 
 def _initial_state(root: XmlElement, model: PlaneModel, key: str | None) -> tuple[dict[str, float], ...]:
-    """Return values and rates of joints, and controls of actuators, by name, from a keyframe."""
+    """Return values and rates of joints, and controls of actuators, by name, from a keyframe; empty without one.
+
+    The keyframe is that named `key`, or by default the one named "initial".
+    """
     keys = {element.attributes.get("name", ""): element for element in merge_parts(root, ("keyframe",)).children}
     problems, joints = model.tree.settings.problems, [joint.name for joint in model.joints]
     if key is not None and key not in keys:
@@ -125,7 +131,10 @@ def _initial_state(root: XmlElement, model: PlaneModel, key: str | None) -> tupl
 
 
 def _tree_joint(model: PlaneModel, body: int, joints: list[TreeJoint]) -> Joint | None:
-    """Return the joint between a body and its holder, from its hinges and slides in order; None if it is free."""
+    """Return the joint between a body and its holder, from its hinges and slides in order; None if the body is free.
+
+    None also if the hinges and slides are refused.
+    """
     holder, kinds = model.holder(body), "".join(joint.kind[0] for joint in joints)
     names, angle = model.names((holder, body)), model.relative_angle(holder, body)
     anchors, axes = [model.plane.flat(joint.anchor) for joint in joints], [model.plane.flat(joint.axis) for joint in joints]
@@ -208,7 +217,7 @@ def _add_armature(
 
 
 def _gaps(mechanism: Mechanism, loops: list[str], size: float) -> list[tuple[str, float]]:
-    """Return the joints of loops that are open in the initial guess, and their gaps (m, rad)."""
+    """Return the names of those of the joints `loops` that are open in the initial guess, and their gaps (m, rad)."""
     gaps = []
     for name in loops:
         joint = mechanism.joints[name]

@@ -262,7 +262,10 @@ class _Writer:
     def _tree_joint(
         self, bodies: Sequence[str], axis: Number | None, points: Array | np.ndarray | None
     ) -> tuple[str, float] | None:
-        """Return the hinge or slide of the tree that is a relative angle, or displacement, of two bodies, and its sign."""
+        """Return the hinge or slide of the tree whose coordinate is a coordinate of two bodies, up to its sign, and the sign.
+
+        The coordinate is a displacement along the axis, or the relative angle without one; None if no hinge or slide has it.
+        """
         if axis is None:
             hinges = self._hinges({bodies[1]: 1.0, bodies[0]: -1.0})
             (hinge, weight), *further = [*hinges.items(), ("", 0.0)]
@@ -295,7 +298,7 @@ class _Writer:
             self.problems.append(f"force {quote(name)}: MJCF has no element for a {type(force).__name__.lower()}")
 
     def _add_friction(self, name: str, force: Friction) -> None:
-        """Add friction to a hinge of the tree: MuJoCo's is a torque of constant size, which holds at rest."""
+        """Add friction to a hinge of the tree: in MuJoCo, this is a torque of constant size that also holds the hinge at rest."""
         hinges = [joint.name for joints in self.joints.values() for joint in joints]
         is_hinge = isinstance(self.mechanism.joints[force.joint], Revolute) and force.joint in hinges
         if force.coefficient is not None:
@@ -330,7 +333,7 @@ class _Writer:
             self._add_fixed(name, factors, "force", springlength=_numbers(abs(free_angle)), **spring)
 
     def _hinges(self, factors: dict[str, float]) -> dict[str, float]:
-        """Return a weighted sum of angles of bodies as a weighted sum of hinges."""
+        """Return a weighted sum of angles of bodies as a weighted sum of angles of hinges: the weights by hinge."""
         hinges: dict[str, float] = {}
         for body, factor in factors.items():
             for hinge, weight in self.turns[body].items():

@@ -76,13 +76,16 @@ class ModelSettings:
         return frame_of(read, self.radians, self.sequence)
 
     def is_limited(self, read: AttributeReader, limited: str, range_name: str) -> bool:
-        """Return True if a range is active: an attribute says so, or the range is given."""
+        """Return True if a range is active: the attribute `limited` says so, or it is absent, and the range is given."""
         word = read.choice(limited, ("true", "false", "auto"), "auto")
         return word == "true" or (word == "auto" and self.autolimits and range_name in read)
 
 
 def merge_parts(root: XmlElement, path: tuple[str, ...]) -> XmlElement:
-    """Merge all elements at a path below the root into one: later attributes override earlier ones."""
+    """Return one element with the attributes and children of all elements at a path below the root.
+
+    Later attributes override earlier ones.
+    """
     elements = [root]
     for tag in path:
         elements = [child for element in elements for child in element.children if child.tag == tag]

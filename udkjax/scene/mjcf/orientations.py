@@ -16,11 +16,11 @@ class SpaceFrame(NamedTuple):
     origin: np.ndarray  # (3,) m
 
     def point(self, local: np.ndarray) -> np.ndarray:
-        """Return the world coordinates (m) of a point of the frame."""
+        """Return the world coordinates (m) of a point that is given in this frame (m)."""
         return self.origin + self.axes @ local
 
     def within(self, child: "SpaceFrame") -> "SpaceFrame":
-        """Return the frame in the world of a frame that is given relative to this one."""
+        """Return the frame in world coordinates of a frame `child` that is given relative to this one."""
         return SpaceFrame(self.axes @ child.axes, self.point(child.origin))
 
 

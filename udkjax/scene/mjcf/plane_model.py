@@ -36,7 +36,7 @@ class PlaneMotion(NamedTuple):
     rate: complex = 0j  # m/s; its velocity is rate + i omega times its position
 
     def point(self, z: complex) -> complex:
-        """Return the position of a point (m)."""
+        """Return the position (m) of the point of the body that is at z in the position of the file."""
         return np.exp(1j * self.angle) * z + self.shift
 
     def velocity(self, z: complex) -> complex:
@@ -44,13 +44,19 @@ class PlaneMotion(NamedTuple):
         return self.rate + 1j * self.omega * z
 
     def turn(self, anchor: complex, angle: float, rate: float) -> "PlaneMotion":
-        """Return the motion after a turn about a point of the body (rad, rad/s)."""
+        """Return the motion after a further turn about a point of the body, which is at `anchor` in the position of the file.
+
+        The turn has an angle (rad) and a rate (rad/s).
+        """
         position, new_angle = self.point(anchor), self.angle + angle
         shift = position - np.exp(1j * new_angle) * anchor
         return PlaneMotion(new_angle, shift, self.omega + rate, self.rate - 1j * rate * position)
 
     def slide(self, direction: complex, distance: float, rate: float) -> "PlaneMotion":
-        """Return the motion after a slide along a direction of the body (m, m/s)."""
+        """Return the motion after a further slide by a distance (m), with a rate (m/s).
+
+        The direction turns with the body; it is given in the position of the file.
+        """
         now = np.exp(1j * self.angle) * direction
         return self._replace(shift=self.shift + distance * now, rate=self.rate + rate * now)
 
@@ -155,7 +161,7 @@ class PlaneModel:
         return float(np.angle(axis * np.exp(-1j * self.bodies[body].angle)))
 
     def names(self, bodies: Sequence[int]) -> tuple[str, ...]:
-        """Return the names of bodies."""
+        """Return the names that bodies have in the mechanism, by their indices."""
         return tuple(self.bodies[body].name for body in bodies)
 
     def attached(self, ends: Ends) -> tuple[tuple[str, ...], list[Pair]]:
@@ -167,15 +173,18 @@ class PlaneModel:
         return self.bodies[body2].angle - self.bodies[body1].angle
 
     def sign(self, joint: TreeJoint) -> float:
-        """Return 1 if a hinge turns anticlockwise, else -1."""
+        """Return 1 if a hinge is anticlockwise positive in the plane, otherwise -1."""
         return float(np.sign(joint.axis @ self.plane.normal))
 
     def reference(self, joint: TreeJoint, name: str = "ref") -> float:
-        """Return the value (rad, m) of a joint in the position of the file, or where its spring is unloaded."""
+        """Return the value (rad, m) of a joint in the position of the file (`ref`), or at which its spring is unloaded."""
         return joint.read.number(name) * (self.tree.settings.radians if joint.kind == "hinge" else 1.0)
 
     def motions(self, values: Mapping[str, float], rates: Mapping[str, float]) -> dict[int, PlaneMotion]:
-        """Return the motions of bodies for values and rates of joints, by default those of the file."""
+        """Return the motions of bodies, by index, for values and rates of joints by name.
+
+        By default joints have their values in the file, and zero rates.
+        """
         by_body = {0: PlaneMotion()}
         for k, body in self.tree.moving():
             motion = by_body[self.holder(k)]

@@ -107,7 +107,7 @@ _CURES = {
 
 
 def unknown_parts(root: XmlElement) -> list[str]:
-    """Return the unsupported parts of a model that could change its motion, elements and attributes, by line."""
+    """Return messages about the elements and attributes of a model that are not supported and could change its motion."""
     problems: list[str] = []
     if root.tag != "mujoco":
         return [f"{root.where}: an MJCF model begins with <mujoco>"]

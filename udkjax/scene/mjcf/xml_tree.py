@@ -51,8 +51,8 @@ def parse_xml(
     Args:
         text: XML; a leading byte order mark is skipped.
         source: The file of the model, whose folder contains included files; or empty.
-        file: The name of the included file, if it is one.
-        within: The files that include it.
+        file: The name of the included file whose text this is; empty for the model itself.
+        within: The names of the files that are being included, outermost first; the last one is `file`.
         included: The files included so far.
 
     Raises:
@@ -106,18 +106,18 @@ class AttributeReader:
         self.element, self.values, self._problems = element, values, problems
 
     def refuse(self, text: str) -> None:
-        """Add a mistake of this element."""
+        """Add a message about this element to the mistakes."""
         self._problems.append(f"{self.element.where}: {text}")
 
     def __contains__(self, name: str) -> bool:
         return name in self.values
 
     def text(self, name: str, default: str = "") -> str:
-        """Return an attribute as text."""
+        """Return an attribute as text; `default` if it is absent."""
         return self.values.get(name, default)
 
     def choice(self, name: str, choices: Sequence[str], default: str) -> str:
-        """Return an attribute with given choices."""
+        """Return an attribute that is one of the choices; `default` if it is absent or, with a mistake, if it is none of them."""
         value = self.values.get(name, default)
         if value in choices:
             return value
@@ -125,7 +125,11 @@ class AttributeReader:
         return default
 
     def numbers(self, name: str, default: Sequence[float] | np.ndarray, fewest: int | None = None) -> np.ndarray:
-        """Return finite numbers, as many as the default has; if at least `fewest` are given, the default supplies the rest."""
+        """Return an attribute as finite numbers, as many as `default` has.
+
+        If at least `fewest` are given, `default` supplies the rest. It is returned if the attribute is absent or, with a mistake,
+        if it is wrong.
+        """
         if name not in self.values:
             return np.array(default, float)
         words = self.values[name].split()
@@ -141,5 +145,5 @@ class AttributeReader:
         return np.array(default, float)
 
     def number(self, name: str, default: float = 0.0) -> float:
-        """Return an attribute that is a single number."""
+        """Return an attribute that is a single number; `default` if it is absent or, with a mistake, if it is wrong."""
         return float(self.numbers(name, [default])[0])

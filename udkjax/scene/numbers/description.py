@@ -17,7 +17,7 @@ LEFT_OUT = ("velocity", "angular_velocity")  # fields omitted if zero
 
 
 def mechanism_table(mechanism: Sections, frame_names: Callable[..., Sequence[str]]) -> PrintedTable:
-    """Return the table of a mechanism; `frame_names` maps an element to its bodies."""
+    """Return the table of a mechanism; `frame_names` maps an element to the names of its bodies."""
     groups = mechanism.groups
     drawing = None if mechanism.departs_from_drawing else mechanism.drawing
     lengths = {} if drawing is None else drawing.length_texts()

@@ -13,14 +13,17 @@ from udkjax.scene.elements.held import Held, given_sampled
 
 
 class DirectNumbers(PrintsLine):
-    """Values by the names of numbers, or of entries of numbers (`joint.A.points[0][1]`); they do not overlap."""
+    """The values that were given directly, by the names of numbers or of entries of numbers (`joint.A.points[0][1]`).
+
+    No value is part of another one.
+    """
 
     names: tuple[str, ...] = eqx.field(static=True)  # sorted
     values: tuple[Any, ...]  # arrays, or a `Held` for a sampled number
 
     @classmethod
     def of(cls, values: Mapping[str, Any], earlier: "DirectNumbers | None" = None) -> "DirectNumbers | None":
-        """Return the earlier numbers with some given anew or in addition; None if there are none."""
+        """Return the earlier numbers with `values` set anew or added; None if both are empty."""
         found = {} if earlier is None else earlier.by_name
         # Arrays before their entries: the order of `values` does not matter, because jit sorts the keys.
         for name in sorted(values, key=lambda name: name.count("[")):
@@ -39,7 +42,7 @@ class DirectNumbers(PrintsLine):
 
 
 def covers(name: str, other: str) -> bool:
-    """Return True if a name is that of a number, or of an array or a `Held` that contains it."""
+    """Return True if the number named `other` is the number `name`, or is contained in it: an entry, or samples of a `Held`."""
     return other == name or other.startswith((f"{name}[", f"{name}.values"))
 
 

@@ -46,7 +46,7 @@ def parse(text: str) -> ast.expr | None:
 
 
 def _parts(node: ast.expr) -> Iterator[ast.expr]:
-    """Iterate over the operands of an expression, itself included; the names of functions are none of them."""
+    """Iterate over an expression, its operands, and the operands of these; names of functions are no operands."""
     yield node
     inner: list[ast.expr] = []
     match node:
@@ -91,7 +91,7 @@ def is_computed(text: str) -> bool:
 
 
 def name_mistake(name: object) -> str:
-    """Return why expressions cannot use a name, or an empty string."""
+    """Return the reason for which expressions cannot use a name; "" if they can."""
     if not isinstance(name, str) or not isinstance(parse(name), ast.Name) or name.strip() != name:
         return "the name of a number has letters, digits and _, so that expressions can use it"
     if name in FUNCTIONS or name in CONSTANTS:
@@ -105,7 +105,8 @@ def evaluate(text: str, numbers: Mapping[str, Measured], sizes: Callable[[str], 
     Args:
         text: the expression.
         numbers: the named numbers.
-        sizes: the size of the drawing's unit, in an SI unit: angles of functions are in the drawing's unit.
+        sizes: function that returns the size of the drawing's unit in a given SI unit; sin, cos, tan and their inverses use the
+            drawing's unit of angle.
 
     Raises:
         ValueError: it cannot be read, uses an unknown name, or adds quantities of different kinds.
@@ -150,7 +151,7 @@ def _combined(op: ast.operator, first: Measured, second: Measured) -> Measured:
 
 
 def _common(unit: str | None, other: str | None) -> str | None:
-    """Return the unit of a sum; a plain number takes that of the other."""
+    """Return the unit of a sum of quantities with two units: a plain number ("") takes the unit of the other one."""
     if unit and other and unit != other:
         raise ValueError(f"it adds a quantity in {unit} and one in {other}")
     return unit if other == "" else other if unit == "" else unit if unit == other else None

@@ -1,4 +1,4 @@
-"""The fields of a mechanism, from elements that are complete."""
+"""The fields of a mechanism, computed from elements whose missing numbers have been filled in."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -15,7 +15,7 @@ from udkjax.scene.tables.element_setup import constants_of, without_constants
 def fields_of(
     sections: Mapping[str, Sequence[tuple[str, Any]]], gravity: Array, name: str, origin: Origin | None
 ) -> dict[str, Any]:
-    """Return all fields of a mechanism of elements that are complete."""
+    """Return the values of all fields of a mechanism, by name, from elements whose missing numbers have been filled in."""
     independent = {section: [(key, without_constants(c)) for key, c in sections[section]] for section in ("joint", "driver")}
     names = tuple(tuple(key for key, _ in sections[section]) for section in SECTIONS)
     elements = [[element for _, element in (independent.get(section) or sections[section])] for section in SECTIONS]

@@ -23,12 +23,12 @@ class NamedNumber(PrintsLine):
 
 
 class Formula(NamedTuple):
-    """An entry of a number of a drawing that is given by an expression.
+    """An expression that gives a number of a drawing, or one entry of a number.
 
     Attributes:
-        section, owner: of the element that has the number.
-        path: the fields that lead to the number.
-        at: the place of the entry; empty if the number has no entries.
+        section, owner: the section and the name of the element that has the number.
+        path: the fields that lead from the element to the number.
+        at: the index of the entry; empty if the expression gives the whole number.
         text: the expression, as it was written.
         unit: the SI unit of the number.
     """
@@ -42,7 +42,7 @@ class Formula(NamedTuple):
 
     @property
     def name(self) -> str:
-        """The name of the entry as a parameter."""
+        """The name of the number or entry as a parameter, such as "pin.A[0]"."""
         entries = "".join(f"[{k}]" for k in self.at)
         path = () if (self.section, self.path) in NAMED_BY_OWNER else self.path
         return ".".join((self.section, self.owner, *path)) + entries
@@ -53,7 +53,10 @@ NAMED_BY_OWNER = (("pin", ("position",)), ("number", ("value",)))
 
 
 def without_expressions(groups: ElementsByName, formulas: Sequence[Formula]) -> ElementsByName:
-    """Return elements whose numbers that are given by expressions are no leaves: None, or zero where they are entries."""
+    """Return elements without the values of numbers that expressions give.
+
+    Such a number is None, or, if only some of its entries are given by expressions, zero at these entries.
+    """
     if not formulas:
         return groups
     changed = {section: dict(group) for section, group in groups.items()}
@@ -72,13 +75,13 @@ def _has_plain_entries(old: Any, section: str, owner: str, path: tuple[str, ...]
 def with_expressions(
     groups: ElementsByName, formulas: Sequence[Formula], measured: Mapping[str, Measured], size: Callable[[str], float]
 ) -> dict[str, dict[str, Any]]:
-    """Return elements with the values of expressions.
+    """Return elements with the values of the numbers that expressions give.
 
     Args:
         groups: elements as from `without_expressions`.
         formulas: the expressions; those of named numbers in the order in which they follow from each other.
         measured: the other named numbers, in the units of the drawing.
-        size: the size of the drawing's unit in an SI unit.
+        size: function that returns the size of the drawing's unit in a given SI unit.
     """
     changed, measured = {section: dict(group) for section, group in groups.items()}, dict(measured)
     whole: dict[tuple[str, str, tuple[str, ...]], dict[tuple[int, ...], Any]] = {}
@@ -125,7 +128,10 @@ def _stored(x: Any) -> Any:
 
 
 def independent(names: Mapping[str, Any], formulas: Iterable[Formula]) -> dict[str, Any]:
-    """Return numbers by name without those that expressions give; the other entries of such a number have names of their own."""
+    """Return numbers by name without those that expressions give.
+
+    If expressions give only some entries of a number, each of the other entries is returned under its own name.
+    """
     given = {formula.name for formula in formulas}
     partly = {name for name in names if any(entry.startswith(f"{name}[") for entry in given)}
     found: dict[str, Any] = {}
@@ -139,7 +145,7 @@ def independent(names: Mapping[str, Any], formulas: Iterable[Formula]) -> dict[s
 
 
 def numbers_in_expressions(formulas: Sequence[Formula], section: str) -> set[str]:
-    """Return the named numbers from which expressions in a section of a drawing follow, directly or through others."""
+    """Return the names of the numbers on which expressions in a section of a drawing depend, directly or through others."""
     by_number = {formula.owner: formula.text for formula in formulas if formula.section == "number"}
     waiting = [formula.text for formula in formulas if formula.section == section]
     found: set[str] = set()
@@ -151,7 +157,7 @@ def numbers_in_expressions(formulas: Sequence[Formula], section: str) -> set[str
 
 
 def formula_mistakes(names: Iterable[str], formulas: Iterable[Formula]) -> Iterator[str]:
-    """Iterate over mistakes in names of parameters to change: numbers that expressions give."""
+    """Iterate over messages about parameters that cannot be changed, among the given names, because expressions give them."""
     for name in names:
         for formula in formulas:
             if name in (formula.name, formula.name.partition("[")[0]) or formula.name.startswith(f"{name}["):

@@ -85,14 +85,14 @@ def parameters_in(groups: Mapping[str, Mapping[str, eqx.Module]]) -> dict[str, N
 
 
 def owner_of(mechanism: Sections, parameter: NumberField) -> eqx.Module:
-    """Return the element that holds a number, or the motion law or profile within the element."""
+    """Return the object that holds a number: an element, or a module within it, such as a motion law or a profile."""
     drawing = None if parameter.section in SECTIONS else mechanism.drawing
     elements = (mechanism if drawing is None else drawing).groups[parameter.section]
     return _at(elements[parameter.owner], parameter.path[:-1])
 
 
 def must_be_positive(mechanism: Any, name: str) -> bool:
-    """Return True for a number, or an entry of one, that its type requires to be positive or zero."""
+    """Return True if a number, or the number of which `name` is an entry, must be positive, or must not be negative."""
     known = mechanism.number_fields()
     field = known[split_index(name, known)[0]]
     if not field.path:
@@ -159,7 +159,7 @@ def replace_numbers(
 
 
 def held_names(known: Collection[str]) -> list[str]:
-    """Return the names of the sampled numbers of forces."""
+    """Return the names of sampled numbers of forces, such as "force.motor.value", from all known names of numbers."""
     return [name.removesuffix(".values") for name in known if name.endswith(".values") and name.startswith("force.")]
 
 
@@ -170,7 +170,7 @@ def _field_of_held(values: NumberField) -> NumberField:
 def _fit(
     given: str, value: Numbers, name: str, index: tuple[int, ...], shape: tuple[int, ...] | None, old: Array | None
 ) -> tuple[Array | None, str]:
-    """Return the new value of a parameter, or None and the reason why it does not fit."""
+    """Return the new value of a parameter and "", or None and a message about the value that does not fit."""
     try:
         new = None if value is None or isinstance(value, bool) else number(value)
     except (TypeError, ValueError, OverflowError):
@@ -187,7 +187,7 @@ def _fit(
 
 
 def split_index(given: str, known: Collection[str]) -> tuple[str, tuple[int, ...]]:
-    """Split `joint.A.points[1][0]` into the parameter and the index of one of its entries."""
+    """Split the name of an entry, `joint.A.points[1][0]`, into the name of the parameter and the index; () for a parameter."""
     match = None if given in known else re.fullmatch(r"(.*?)((?:\[\d+\])+)", given)
     return (given, ()) if match is None else (match[1], tuple(int(i) for i in re.findall(r"\d+", match[2])))
 

@@ -1,4 +1,4 @@
-"""The concrete mechanism behind one whose numbers are traced."""
+"""The concrete mechanism from which a mechanism with traced numbers was made."""
 
 from typing import Any
 
@@ -7,7 +7,7 @@ import numpy as np
 
 
 class Origin:
-    """The concrete mechanism from which one with traced numbers was made. It is hashable, and compares by value."""
+    """The concrete mechanism from which a mechanism with traced numbers was made, hashable and compared by value."""
 
     def __init__(self, mechanism: Any):
         self.mechanism = mechanism

@@ -1,8 +1,8 @@
 """Sources of a mechanism: the independent numbers, which are the leaves of its tree, and the elements that follow from them.
 
 The elements of most mechanisms are independent (`Elements`). Gears and racks have a constant that follows from the initial guess
-(`ElementsWithConstants`), and all elements of a drawn mechanism follow from its drawing (`Drawn`). What follows is never a leaf:
-whatever JAX does to a mechanism as a tree, it is computed from the leaves where it is needed.
+(`ElementsWithConstants`), and all elements of a drawn mechanism follow from its drawing (`Drawn`). Numbers that follow are never
+leaves: whatever JAX does to a mechanism as a tree, they are computed from the leaves where they are needed.
 """
 
 import dataclasses
@@ -51,13 +51,13 @@ class Elements(QuickMethods):
 
     @classmethod
     def of(cls, gravity: Any, sections: Sequence[Sequence[Any]], **more: Any) -> "Elements":
-        """Return the elements of sequences of bodies, joints, drivers and forces."""
+        """Return an instance from sequences of bodies, joints, drivers and forces; `more` are fields of a subclass."""
         bodies, joints, drivers, forces = (tuple(elements) or None for elements in sections)
         return make_module(cls, gravity=gravity, bodies=bodies, joints=joints, drivers=drivers, forces=forces, **more)
 
     @property
     def elements(self) -> "Elements":
-        """The elements with all numbers of the equations."""
+        """The elements with all numbers that the equations need, including those that follow from others."""
         return self
 
     def groups(self, names: Sequence[Sequence[str]]) -> ElementGroups:
@@ -67,7 +67,7 @@ class Elements(QuickMethods):
 
 
 class ElementsWithConstants(Elements):
-    """Elements of which some constraints have constants that follow from the initial guess of the bodies."""
+    """Elements with constraints whose constants follow from the initial guess of the bodies, such as those of gears."""
 
     names: tuple[tuple[str, ...], ...] = eqx.field(static=True)  # of bodies, joints, drivers and forces
 
@@ -76,7 +76,7 @@ class ElementsWithConstants(Elements):
         return elements_of(self)
 
     def derived(self) -> tuple[Elements, "Derivation"]:
-        """Return the elements with their constants, and where each of their numbers is from."""
+        """Return the elements with their constants, and the origin of each of their numbers."""
         bodies = dict(zip(self.names[0], self.bodies or (), strict=True))
         constraints = ([with_constants(x, bodies) for x in group or ()] for group in (self.joints, self.drivers))
         elements = Elements.of(self.gravity, (self.bodies or (), *constraints, self.forces or ()))
@@ -129,7 +129,7 @@ class AbstractDrawing(PrintsTable):
 
     @abstractmethod
     def length_texts(self) -> Mapping[str, str]:
-        """Return the lengths of each body and of the ground as text; empty if numbers are traced."""
+        """Return the lengths of each body and of the ground as text, by name; empty if numbers are traced."""
 
     @abstractmethod
     def dimensions(self) -> Mapping[tuple[str, str], str]:
@@ -137,7 +137,10 @@ class AbstractDrawing(PrintsTable):
 
     @abstractmethod
     def touching_pins(self) -> list[str]:
-        """Return the pins whose places have no derivatives, as circles only touch there. Numbers are concrete."""
+        """Return the names of pins whose places have no derivatives, such as those where circles only touch.
+
+        The numbers of the drawing must be concrete.
+        """
 
     @abstractmethod
     def shapes(self) -> dict[str, Array]:
@@ -150,11 +153,11 @@ class AbstractDrawing(PrintsTable):
     @property
     @abstractmethod
     def polygons(self) -> list[str]:
-        """The bodies that are polygons with these points, in order, as corners."""
+        """The names of the bodies that are polygons, whose `shapes` are the corners in order."""
 
     @abstractmethod
     def free_pins(self) -> dict[str, tuple[str, Array]]:
-        """Return the pins that belong to a single body: the body, and the position in its frame (m)."""
+        """Return the body and the position in its frame (m) of each pin that belongs to a single body, by the pin's name."""
 
 
 class Drawn(QuickMethods):
@@ -165,7 +168,7 @@ class Drawn(QuickMethods):
 
     @property
     def elements(self) -> Elements:
-        """The elements with all numbers of the equations."""
+        """The elements with all numbers that the equations need."""
         return elements_of(self)
 
     @property
@@ -174,7 +177,7 @@ class Drawn(QuickMethods):
         return self.drawing.gravity
 
     def derived(self) -> tuple[Elements, "Derivation"]:
-        """Return the elements that follow from the drawing, and where each of their numbers is from."""
+        """Return the elements that follow from the drawing, and the origin of each of their numbers."""
         groups = dict(_drawn_elements(self.drawing))
         if self.direct is not None:
             groups, _ = replace_numbers(groups, self.gravity, self.direct.by_name, parameters_in(groups), "")
@@ -193,14 +196,14 @@ Source = Elements | Drawn
 
 @cached_by_identity(within_trace=True)  # many mechanisms of one drawing differ in numbers that are given directly
 def _drawn_elements(drawing: AbstractDrawing) -> ElementGroups:
-    """Return the elements that follow from a drawing, with the numbers taken from the initial guess."""
+    """Return the elements that follow from a drawing, including the numbers that constraints take from the initial guess."""
     groups = drawing.elements()
     completed = {s: {name: complete(x, groups["body"]) for name, x in groups[s].items()} for s in ("joint", "driver")}
     return groups | completed
 
 
 class Derivation:
-    """The origin of each number of elements: the place of a leaf of the source, or None for a number that is computed."""
+    """The origin of each number of elements: the index of a leaf of the source, or None for a number that is computed."""
 
     def __init__(self, source: Source, elements: Elements, names: Mapping[str, tuple[str, ...]]):
         """Find the places by the identity of the leaves."""
@@ -227,7 +230,10 @@ class Derivation:
 
 
 class Follows:
-    """The stand-in of a number that is computed, in a tree whose leaves are not numbers: it cannot be used."""
+    """A stand-in for a number that would be computed from leaves that are not numbers, as in `eqx.tree_at`.
+
+    It cannot be used: an attempt raises a `SceneError` with its text.
+    """
 
     def __init__(self, text: str):
         self.text = text
@@ -290,7 +296,7 @@ def names_of(source: Drawn) -> tuple[tuple[str, ...], ...]:
 
 
 def _distinct(leaves: Leaves) -> list[Any]:
-    """Return leaves with copies of those that are the same object as an earlier one."""
+    """Return leaves that are all different objects: a leaf that is the same object as an earlier one is replaced by a copy."""
     found: dict[int, Any] = {}
     for x in leaves:
         if id(x) in found:
@@ -306,7 +312,7 @@ def _remember(tree: TreeDef, derivation: Derivation) -> None:
 
 
 def _transformed(leaves: Leaves, tree: TreeDef, axes: Sequence[int]) -> Elements:
-    """Return the elements of a batch, whose leaves have further leading axes, or of shapes."""
+    """Return the elements of a source in a batch, whose leaves have `axes` leading batch axes, or of one that has only shapes."""
     found: list[Derivation] = []
 
     def numbers(*leaves: Any) -> list[Any]:
@@ -323,7 +329,7 @@ def _transformed(leaves: Leaves, tree: TreeDef, axes: Sequence[int]) -> Elements
 
 
 def _batch_axes(source: Any, leaves: Leaves) -> list[int]:
-    """Return the number of leading axes of each leaf that it has because numbers of several mechanisms are stacked."""
+    """Return the number of batch axes of each leaf: leading axes along which numbers of several mechanisms are stacked."""
     of_all = max(np.ndim(source.gravity) - 1, 0)
     if isinstance(source, Drawn):
         modules: list[Any] = [element for group in source.drawing.own_groups.values() for element in group.values()]

@@ -108,7 +108,7 @@ def units_of(mechanism: Any, name: str) -> str:
 
 
 def field_unit(type_name: str, field: str, driven: str = "") -> str:
-    """Return the unit of a field of a scene class; for a motion law it depends on the driven coordinate."""
+    """Return the unit of a field of a scene class, "" if unknown; that of a motion law depends on the driven coordinate."""
     if field in FOLLOWS:
         return "rad" if driven == "angle" else "m"
     return _OF_TYPE.get((type_name, field), _FIELDS.get(field, ""))
@@ -204,7 +204,7 @@ def conversion_factor(units: str, wanted: str) -> float:
 
     Args:
         units: products written with a space, powers as m/s2 or m/s^2. "g" is a gram; for an acceleration, 9.80665 m/s2.
-        wanted: the units of a channel.
+        wanted: the SI units of the converted numbers.
 
     Raises:
         ValueError: `units` are unknown, or have another dimension.

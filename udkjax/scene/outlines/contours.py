@@ -27,7 +27,7 @@ class Contour(NamedTuple):
 
     @property
     def circle(self) -> tuple[Float[np.ndarray, "2"], float] | None:
-        """The centre and the radius, if the contour is a circle."""
+        """The centre and the radius, if the contour is a circle; otherwise None."""
         arcs = [piece for piece in self.pieces if isinstance(piece, Arc)]
         if len(arcs) < len(self.pieces) or abs(abs(sum(x.sweep for x in arcs)) - 2 * np.pi) > 1e-9:
             return None
@@ -41,7 +41,7 @@ class Contour(NamedTuple):
 
 
 def size_of_pieces(drawn: Sequence[DrawnPiece]) -> float:
-    """Return the larger side of the box around pieces."""
+    """Return the longer side of the bounding box of pieces, by points on them."""
     points = np.concatenate([x.piece.at(np.linspace(0, 1, 9))[0] for x in drawn])
     return float(np.ptp(points, axis=0).max())
 
@@ -51,8 +51,8 @@ def contours_of(drawn: Sequence[DrawnPiece], scale: float, unit: str) -> tuple[l
 
     Args:
         drawn: pieces in m, in any order and direction.
-        scale: m per unit of the file.
-        unit: its name.
+        scale: the file's unit (m).
+        unit: the name of the file's unit.
     """
     near, problems, found = JOINED * size_of_pieces(drawn), [], []
 
@@ -110,7 +110,7 @@ def _crossings(found: Sequence[Contour], chord: float, place: Callable[[np.ndarr
 
 
 def contains(polygon: Float[np.ndarray, "n 2"], point: Float[np.ndarray, "2"]) -> bool:
-    """Return whether a point is within a polygon."""
+    """Return True if a point is inside a polygon."""
     p, q = polygon - point, np.roll(polygon, -1, axis=0) - point
     spans = (p[:, 1] > 0) != (q[:, 1] > 0)
     p, q = p[spans], q[spans]

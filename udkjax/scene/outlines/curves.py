@@ -40,7 +40,7 @@ class Bezier(NamedTuple):
 
 
 class Arc(NamedTuple):
-    """An arc of a circle or an ellipse, centre + cos(angle) x + sin(angle) y, from an angle on over a sweep (rad)."""
+    """An arc of a circle or an ellipse, centre + cos(angle) x + sin(angle) y, from angle `start` to `start` + `sweep` (rad)."""
 
     centre: Float[np.ndarray, "2"]
     x: Float[np.ndarray, "2"]
@@ -73,7 +73,7 @@ def line(start: Sequence[float] | np.ndarray, end: Sequence[float] | np.ndarray)
 
 
 def circle(centre: Sequence[float] | np.ndarray, radius: float) -> Arc:
-    """Return a circle, anticlockwise."""
+    """Return a whole circle, anticlockwise from its rightmost point."""
     return Arc(np.array(centre, float), np.array([radius, 0.0]), np.array([0.0, radius]), 0.0, 2 * np.pi)
 
 

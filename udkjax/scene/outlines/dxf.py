@@ -15,7 +15,7 @@ IGNORED = {"TEXT", "MTEXT", "DIMENSION", "POINT", "HATCH", "LEADER", "ATTDEF", "
 
 
 def read_dxf(path: str | os.PathLike[str], layers: tuple[str, ...] | None) -> tuple[list[DrawnPiece], str | None, list[str]]:
-    """Return the pieces of the model space in the file's unit, that unit if the file names it, and mistakes."""
+    """Return the pieces of the model space in the file's unit, that unit (None if the file does not name it), and mistakes."""
     with OptionalImport():
         import ezdxf
         from ezdxf import upright

@@ -14,7 +14,7 @@ FITS = 1e-3  # of a hole's radius: distance of a pin from its centre, and differ
 
 
 class HolePins:
-    """The pins of a drawing by position, and those that holes add.
+    """The pins of a drawing, found by their positions, and the pins that are added at holes.
 
     Args:
         pins: the table of pins of the scene; those by coordinates have known places.
@@ -28,7 +28,7 @@ class HolePins:
         self._unknown = [name for name in pins if name not in self._places]
 
     def of_link(self, name: str, outline: Outline, diameter: float | None, problems: list[str]) -> list[str]:
-        """Return the pins of a link at its round holes, from left to right; a hole without a pin gets a new one.
+        """Return the names of the pins at the round holes of a link, from left to right; a hole without a pin gets a new one.
 
         Args:
             name: the name of the link, with which names of new pins begin.
@@ -54,7 +54,7 @@ class HolePins:
         return [pin for pin in found if pin is not None]
 
     def _at(self, hole: RoundHole, problems: list[str]) -> str | None:
-        """Return the pin in a hole; None if the hole has no pin."""
+        """Return the name of the pin in a hole; None if the hole has no pin."""
         for name, place in self._places.items():
             off = float(np.hypot(*(place - hole.centre)))
             if off < hole.radius:
@@ -76,5 +76,5 @@ class HolePins:
 
 
 def names_of_links(links: Sequence[Any]) -> list[str]:
-    """Return the names of links in the order of a scene; a link without one has its number."""
+    """Return the names of links in the order of a scene, "link1", ... for links without one; "" for an entry that is no table."""
     return [str(link.get("name") or f"link{k + 1}") if isinstance(link, Mapping) else "" for k, link in enumerate(links)]

@@ -65,7 +65,10 @@ class Outline(NamedTuple):
         return self.outer.polygon(CHORD * float(np.sqrt(self.area)) if chord is None else float(chord))
 
     def hole_polygons(self, chord: float | None = None) -> Float[np.ndarray, "holes n 2"] | None:
-        """Return corners (m) of the holes, the same number for each, some of them repeated; None without any."""
+        """Return corners (m) of polygons of the holes, the same number for each, since corners may be repeated.
+
+        The sides are nearer to the holes than `chord` (m). The result is None if the outline has no holes.
+        """
         chord = CHORD * float(np.sqrt(self.area)) if chord is None else float(chord)
         found = [hole.polygon(chord) for hole in self.holes]
         most = max(map(len, found), default=0)

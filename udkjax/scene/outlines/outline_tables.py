@@ -21,7 +21,7 @@ FROM_AREA = {"density": "kg/m3", "thickness": "m"}  # with which the area gives 
 
 
 def with_outlines(scene: Mapping[str, Any], source: str) -> Mapping[str, Any]:
-    """Return the tables of a drawing with corners, holes, mass, centre and inertia of outlines that are files.
+    """Return the tables of a drawing in which outlines from files are replaced by corners, holes, mass, centre and inertia.
 
     A link without `pins` has the pins at its round holes (hole_pins.py).
 
@@ -47,7 +47,7 @@ def with_outlines(scene: Mapping[str, Any], source: str) -> Mapping[str, Any]:
 
 
 class _File(NamedTuple):
-    """The outline of a link from a file, its largest distance from the polygon (m), and the path of the link for messages."""
+    """The outline of a link from a file, the distance `chord` (m) for its polygon, and the path of the link for messages."""
 
     outline: Outline
     chord: float | None
@@ -55,7 +55,7 @@ class _File(NamedTuple):
 
 
 def _with_files(scene: Mapping[str, Any], source: str) -> tuple[dict[str, Any], dict[int, _File], Units, list[str]] | None:
-    """Return tables with pins at holes, outlines from files by number of link, units, and mistakes; None without files."""
+    """Return tables with pins at holes, outlines from files by index of the link, units, and mistakes; None without files."""
     links, problems = scene.get("link"), []
     if not isinstance(links, list) or not any(isinstance(x, dict) and isinstance(x.get("outline"), str | dict) for x in links):
         return None
@@ -117,7 +117,10 @@ def _with_outline(link: dict[str, Any], file: _File, units: Units, problems: lis
 
 
 def _masses(link: dict[str, Any], outline: Outline, path: str, units: Units, problems: list[str]) -> dict[str, Any]:
-    """Return mass, inertia and centre of a link, exact for its outline, where they are not given."""
+    """Return keys of the table of a link: its mass and inertia, given or exact for its outline, and the centre of the outline.
+
+    The result is empty if the mass is unknown, which is a problem.
+    """
     if "mass" in link:
         mass = units.convert(f"{path}.mass", link["mass"], "kg", problems)
     else:

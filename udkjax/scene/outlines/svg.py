@@ -15,9 +15,9 @@ PIXELS = 96.0  # per inch, as CSS has it
 
 
 def read_svg(path: str | os.PathLike[str]) -> tuple[list[DrawnPiece], str | None, list[str]]:
-    """Return the pieces of all shapes, the unit if the file's width has one, and mistakes. The y axis points up.
+    """Return the pieces of all shapes, their unit ("mm", or None), and mistakes. The y axis points up.
 
-    With a unit the pieces are in mm, otherwise in the units that the file's view box gives.
+    If the width of the file has a unit, the pieces are in mm; otherwise they are in the units of the file's view box.
     """
     with OptionalImport():
         import svgelements as svg

@@ -47,7 +47,7 @@ class Mistakes(ValueError):
 
 
 class SceneError(Mistakes):
-    """A scene contains mistakes. `problems` lists all of them, each with the path of its entry.
+    """An error for a scene that contains mistakes. `problems` lists all of them, each with the path of its entry.
 
     Attributes:
         problems: all mistakes, each with the path of its entry.
@@ -103,7 +103,10 @@ def problems_of(entries: Sequence[SceneEntry], gravity: object) -> list[str]:
 
 
 def _repeated_friction(entries: Sequence[SceneEntry]) -> Iterator[str]:
-    """Iterate over friction of a joint that has a coefficient already, or that is not alone although one of them sticks."""
+    """Iterate over mistakes of joints with several elements of friction.
+
+    Only one of these may have a coefficient, and friction with the set-valued law must be the only friction of its joint.
+    """
     by_joint: dict[object, list[SceneEntry]] = {}
     for entry in entries:
         if entry.cls is None or not issubclass(entry.cls, Friction):
@@ -119,7 +122,7 @@ def _repeated_friction(entries: Sequence[SceneEntry]) -> Iterator[str]:
 
 
 def name_mistake(name: object) -> str:
-    """Return why messages, tables and commands cannot show the name of an element, with the cure; empty if they can."""
+    """Return the mistake in a name that messages, tables and commands cannot show, with a cure; "" if they can show it."""
     if not isinstance(name, str) or not name:
         return "missing" if name is None else f"must be a non-empty string, not {abbreviate(name)}"
     shown = "".join(c for c in name if unicodedata.category(c) not in ("Cc", "Cs", "Zl", "Zp")).strip()
@@ -156,7 +159,7 @@ def _strict_conditions(elements: Iterable[eqx.Module]) -> Iterator[Any]:
 
 @cache
 def _strict_requirements(cls: type) -> dict[str, list[Requirement]]:
-    """Return the strict requirements on the fields of a class that have any."""
+    """Return the strict requirements on the fields of a class, by field; fields without any are left out."""
     strict = {x.name: [r for r in x.metadata.get("require", ()) if r.strict] for x in dataclasses.fields(cls)}
     return {name: required for name, required in strict.items() if required}
 
@@ -256,7 +259,7 @@ def _check_held(path: str, dims: Sequence[str], value: Any) -> Iterator[str]:
 
 
 def find_class(path: str, choices: Mapping[str, type], table: TomlTable) -> tuple[type | None, str]:
-    """Return the class that a table's `type` names, or None and the mistake."""
+    """Return the class that a table's `type` names and "", or None and the mistake."""
     kind = table.get("type")
     if isinstance(kind, str) and kind in choices:
         return choices[kind], ""
@@ -314,7 +317,7 @@ def _as_array(value: object) -> np.ndarray | None:
 
 
 def _check_references(path: str, kind: str | None, value: object, known: KnownNames) -> Iterator[str]:
-    """Iterate over the mistakes in names of bodies and joints."""
+    """Iterate over the mistakes in a field that holds names of elements of a kind, such as "body"; None: no names."""
     if kind is None or kind not in known:  # the field holds no name, or belongs to a nested module
         return
     named = known[kind]

@@ -68,9 +68,9 @@ def check_elements(given: Mapping[str, list], gravity: Numbers, name: str) -> di
 
 
 def replaced(before: Groups, after: Groups) -> Groups | None:
-    """Return other elements, with their missing numbers, if they are valid because those `before` are; otherwise None.
+    """Return the elements `after`, with missing numbers filled in, if they are valid given that those `before` are.
 
-    Only elements that differ are checked. None means that all elements need to be checked, which finds all mistakes in order.
+    Only elements that differ are checked. None means that all elements have to be checked, which finds all mistakes in order.
     """
     if any(before[section].keys() != after[section].keys() for section in ("body", "joint")):
         return None  # names of bodies and joints, to which others refer
@@ -116,12 +116,12 @@ def as_leaves(element: AnyModule) -> AnyModule:
 
 
 def _as_number(leaf: object) -> object:
-    """Convert the plain numbers of user-written elements, which would be static."""
+    """Return a leaf as an array if it is a plain number, which would be static, as in a user-written element."""
     return given_number(leaf) if isinstance(leaf, int | float | np.ndarray | np.number) and not isinstance(leaf, bool) else leaf
 
 
 def _as_static(leaf: object) -> object:
-    """Wrap a leaf that is not a number, so that it is static."""
+    """Return a leaf that is not a number wrapped as a `StaticValue`; return arrays and shapes unchanged."""
     return leaf if eqx.is_array(leaf) or isinstance(leaf, jax.ShapeDtypeStruct) else StaticValue(leaf)
 
 
@@ -146,7 +146,10 @@ def complete(constraint: AnyConstraint, bodies: Mapping[str, Body]) -> AnyConstr
 
 @cache
 def constants_of(cls: type) -> tuple[str, ...]:
-    """Return the numbers of a class of constraints that always follow from the initial guess: no arguments of its constructor."""
+    """Return the names of the numbers of a class of constraints that always follow from the initial guess.
+
+    They are no arguments of the constructor, such as the constant of a gear.
+    """
     if cls.complete is Constraint.complete:
         return ()
     names = ((f.name, f.default if f.default_factory is dataclasses.MISSING else f.default_factory()) for f in _made(cls))

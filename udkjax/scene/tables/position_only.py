@@ -1,4 +1,4 @@
-"""Functions of positions refuse mechanisms whose joints restrict velocities alone."""
+"""The refusal of mechanisms with joints that restrict velocities alone, by functions of positions."""
 
 from typing import Any
 
@@ -8,7 +8,10 @@ from udkjax.wording import join_names, quote
 
 
 def refuse_rolling(mechanism: Any, what: str) -> None:
-    """Raise a `SceneError` that names the rolling joints of a mechanism, if it has any: `what` needs positions alone."""
+    """Raise a `SceneError` that names the rolling joints of a mechanism, if it has any.
+
+    `what` begins the message: it states the need for positions, as in "modes need positions that the constraints determine".
+    """
     if names := rolling_joints(mechanism):
         cure = "positions depend on the path there; simulate it, or leave these joints out"
         raise SceneError([f"{what}: {join_names(list(map(quote, names)))} restrict velocities alone: {cure}"], mechanism.name)

@@ -87,7 +87,7 @@ def keys(cls: type) -> Mapping[str, Key]:
 
 
 def table_of(element: eqx.Module) -> dict[str, object]:
-    """Return an element as a table without absent values (None where it is the default); nested modules stay modules."""
+    """Return an element as a table, without keys whose value None means that they are absent; nested modules stay modules."""
     table = {name: getattr(element, key.field) for name, key in keys(type(element)).items()}
     may_be_absent = _optional_keys(type(element))
     return {name: value for name, value in table.items() if value is not None or name not in may_be_absent}
@@ -101,7 +101,7 @@ def _optional_keys(cls: type) -> frozenset[str]:
 
 
 def build(annotation: Any, value: object) -> Any:
-    """Make an element, including nested modules, from a checked table."""
+    """Return the element, or nested module, of a class `annotation` from a checked table; return any other value unchanged."""
     if not isinstance(value, dict):
         return (
             str(value) if isinstance(value, np.str_) else value
