@@ -8,10 +8,10 @@ where L is the constant torque, plus the static coefficient times the load of th
 its multiplier is -f. Masses enter by weights only: lambda = lambda_0 + A phi + N s, where N s are internal loads, which cancel.
 
 L is a norm of loads, and lies above its tangents. So for tangents at any lambda, the phi and s that meet their inequalities are a
-convex set of admissible ones, over which a linear program finds the largest f. New tangents at its solution allow more, until
-nothing changes, as in Newton's method. All states on the way are admissible, those between them as well: friction can hold the
-mechanism by every effort from that without friction to the bound. All admissible states are no convex set, and a search may
-end at a smaller bound where a load turns round: further ones begin where the friction of each joint is largest.
+convex set of admissible ones, over which a linear program finds the largest f. New tangents at its solution allow a larger f, and
+so on until nothing changes, as in Newton's method. All states on the way are admissible, and so are those between them: friction
+can hold the mechanism by every effort from that without friction to the bound. The set of all admissible states is not convex,
+and a search may end at a smaller bound where a load reverses: further searches begin where the friction of each joint is largest.
 """
 
 from functools import partial
@@ -73,7 +73,7 @@ class Reactions(NamedTuple):
 
 
 class Balance(NamedTuple):
-    """The parts of loads that the constraints do not balance, as work per radian or characteristic length."""
+    """The motion that constraints admit, and loads that they do not balance, as work per radian or characteristic length."""
 
     motion: Float[Array, ""]  # the part of a unit speed along the coordinate that constraints admit: 1 where it moves
     force: Float[Array, ""]  # its size for F
@@ -83,7 +83,7 @@ class Balance(NamedTuple):
 def reactions_at(
     mechanism: Mechanism, analysis: Analysis, t: Time, q: Float[Array, "n"], row: int = 0
 ) -> tuple[Reactions, "Balance"]:
-    """Return the equilibria of a position at rest, and the unbalanced part of the loads.
+    """Return the equilibria of a position at rest, and the parts of the loads that the constraints do not balance.
 
     Args:
         mechanism: the mechanism, with a driver for the coordinate.
@@ -119,7 +119,7 @@ def reactions_at(
 
 
 def limits(mechanism: Mechanism, reactions: Reactions, z: Float[Array, "N"]) -> Float[Array, "K"]:
-    """Return the largest friction L of each joint for x and s, in the units of x."""
+    """Return the largest friction L of each joint, in the units of x, for z as in `Reactions.at`."""
     rows: dict[str, list[int]] = {}
     for k, (owner, _) in enumerate(constraints.row_names(mechanism)):
         rows.setdefault(owner, []).append(k)
@@ -199,10 +199,10 @@ def largest_effort(mechanism: Mechanism, reactions: Reactions, sign: float) -> F
 
 @deferred
 def friction_holds_around(mechanism: Mechanism, analysis: Analysis, t: Time, q: Float[Array, "n"], free: int) -> Bool[Array, ""]:
-    """Return whether friction holds the mechanism in all positions around a position of rest.
+    """Return True if friction holds the mechanism in all positions around a position of rest q, at time t (s).
 
-    Loads change little around it, and so need little friction to balance them. It does if the joints that carry loads, or have a
-    constant torque, resist motions in all `free` directions.
+    Loads change little around q, so that little friction balances them. Friction holds the mechanism if the joints that carry
+    loads, or have a constant torque, resist motions in all of its `free` degrees of freedom.
     """
     reactions, balance = reactions_at(mechanism, analysis, t, q)
     if not free:

@@ -54,7 +54,7 @@ class Equilibrium(PrintsTable):
         q: x, y (m) and angle (rad) of each body.
         balanced: whether loads and constraint forces cancel.
         bodies: the names of the bodies, in the order of q.
-        left_out: the names of all friction.
+        left_out: the names of all `Friction` elements, which are left out of the balance of loads.
         holds_around: whether friction holds the mechanism in all positions around this one, too.
     """
 
@@ -217,7 +217,7 @@ def degrees_of_freedom(analysis: Analysis) -> int:
 
 
 def _rest_curve(mechanism: Mechanism, analysis: Analysis, by: ControlFlow) -> AbstractCurve:
-    """Return the positions of the mechanism as a curve over time."""
+    """Return the positions of the mechanism as a curve whose value is time: `correct` closes positions at a fixed time."""
     return (Curve if by is BY_JAX else NumpyCurve).of(Driven(mechanism, analysis, "", -1, 1.0))
 
 
@@ -259,9 +259,9 @@ def _equilibrium(
 def _settle(
     curve: AbstractCurve, near: Linearizer, t: Float[Array, ""], q: Float[Array, "n"], free: int, stable: bool
 ) -> Float[Array, "n"]:
-    """Take Newton steps until a step no longer improves the position.
+    """Return the position after Newton steps from q, which end when a step does not improve the position.
 
-    Unbalanced loads may have a minimum where they do not vanish: from there, steps go downhill.
+    Unbalanced loads may have a minimum where they do not vanish: from there, steps go downhill. With `stable`, all steps do.
     """
     if not free:
         return q
@@ -318,7 +318,7 @@ def _step_units(units: Float[Array, "n"], q: Float[Array, "n"], xp: ArrayLibrary
 
 
 def _towards_rest(linearization: Linearization, scale: LoadScale, stable: bool, curve: AbstractCurve) -> Float[Array, "f"]:
-    """Return the step eta of the linearization; only downhill if the equilibrium is to be stable."""
+    """Return a step eta along the directions of the linearization: Newton's step or, if `stable`, one that goes downhill."""
     xp, rounding = curve.by.xp, SMALLEST_STIFFNESS * scale.stiffness
     if xp is np and len(linearization.force) == 1:  # in a fifth of the time of decompositions
         stiffness = linearization.stiffness[0, 0]

@@ -41,9 +41,10 @@ class HoldingEfforts(PrintsTable):
     Attributes:
         values: values of the coordinate (rad, m).
         q: x, y (m) and angle (rad) of each body.
-        lower: below this effort (N m along an angle, N along a length) it moves backwards; minus infinity: no effort moves it.
-        upper: above this effort it moves forwards; infinity: no effort moves it.
-        without_friction: the only effort that would hold it without friction.
+        lower: the effort (N m along an angle, N along a length) below which the coordinate moves backwards; minus infinity: no
+            effort moves it.
+        upper: the effort above which the coordinate moves forwards; infinity: no effort moves it.
+        without_friction: the only effort that would hold the mechanism without friction.
         by_preload: whether `lower` and `upper` are infinite because of preloads alone; otherwise friction locks the mechanism.
         redundant: the names of the redundant constraints, between which there may be preloads.
     """
@@ -69,7 +70,7 @@ class HoldingEfforts(PrintsTable):
         return PrintedTable("efforts that hold a mechanism at rest", [*rows, ("rests without effort", alone), *self._reasons()])
 
     def _reasons(self) -> list[tuple[str, str]]:
-        """Return why bounds are infinite."""
+        """Return rows of the table that say at how many values bounds are infinite, and for which reason."""
         infinite = np.isinf(np.stack([np.asarray(self.lower), np.asarray(self.upper)], 1))
         preloaded = np.asarray(self.by_preload)
         reasons = {
@@ -123,7 +124,7 @@ def holding_efforts(
         preload: whether redundant constraints may have any internal loads; False: loads are those of least norm, as in runs.
 
     Returns:
-        The `HoldingEfforts`.
+        A `HoldingEfforts`, with two bounds for each value.
 
     Raises:
         SceneError: no such driver or coordinate, or positions do not follow from it.

@@ -34,7 +34,7 @@ CLEARLY_ALONG = 0.1  # least part of a unit vector along the constraints that de
 
 
 class Linearization(NamedTuple):
-    """The reduced matrices at a position, and their directions N."""
+    """The equations of small motions at a position at rest, in the free directions N, and its loads."""
 
     directions: Float[Array, "n f"]  # N, orthonormal in the metric of M
     mass: Float[Array, "f f"]  # the unit matrix; its derivatives vanish only to first order
@@ -126,7 +126,7 @@ class NumpyLinearizer:
         return Linearization._make(found)
 
     def _eliminate(self, t: Any, q: Any) -> Linearization | None:
-        """Return the linearization in one direction; None if that needs singular values."""
+        """Return the linearization of a mechanism with one free direction, by elimination; None if it needs singular values."""
         if self._eliminated is None or self._direction is None:
             return None
         found = self._eliminated.linearization(float(t), q, self._direction)
@@ -146,7 +146,7 @@ class NumpyLinearizer:
         return Linearization._make(together)
 
     def scale(self, t: Any, q: Any) -> LoadScale:
-        """Return the scales of forces and stiffnesses at rest."""
+        """Return the scales of forces and stiffnesses at rest in a position q at time t (s)."""
         at_rest = self._terms.loads_at_rest(t, q)
         return scale_of(at_rest.sizes, at_rest.stiffness, self._terms.mass, self._units, np)
 
@@ -163,7 +163,7 @@ class TracedLinearizer(NamedTuple):
         return linearize(self.mechanism, self.analysis, self.free, t, q)
 
     def scale(self, t: ArrayLike, q: Float[Array, "n"]) -> LoadScale:
-        """Return the scales of forces and stiffnesses at rest."""
+        """Return the scales of forces and stiffnesses at rest in a position q at time t (s)."""
         return load_scale(self.mechanism, self.analysis.scales, t, q)
 
 
@@ -171,7 +171,7 @@ Linearizer = NumpyLinearizer | TracedLinearizer
 
 
 def linearizer(mechanism: Mechanism, analysis: Analysis, free: int, by: ControlFlow) -> Linearizer:
-    """Return the linearizer of a mechanism with `free` degrees of freedom."""
+    """Return the linearizer of a mechanism with `free` degrees of freedom; that of concrete numbers is cached."""
     return (TracedLinearizer if by is BY_JAX else _linearizer_of_concrete)(mechanism, analysis, free)
 
 
@@ -192,6 +192,6 @@ def with_unit_mass(at: Linearization, by: ControlFlow) -> tuple[Array, Array]:
 
 
 def solver_of_mass(at: Linearization, by: ControlFlow) -> Callable[[Any], Any]:
-    """Return A -> L^(-1) A with the mass matrix L L^T."""
+    """Return the function A -> L^(-1) A, with the Cholesky factor L of the mass matrix L L^T."""
     L = by.xp.linalg.cholesky(at.mass)
     return partial(jax.scipy.linalg.solve_triangular, L, lower=True) if by is BY_JAX else partial(np.linalg.solve, L)

@@ -19,7 +19,7 @@ from udkjax.scene.mechanism import Mechanism
 
 
 class LoadScale(NamedTuple):
-    """Sizes in the metric of the mass matrix; zero if there are no loads at the position and nearby."""
+    """The scales of forces and stiffnesses in the metric of the mass matrix; zero without loads at the position and nearby."""
 
     force: Float[Array, ""]  # N/sqrt(kg): of M^(-1/2) F
     stiffness: Float[Array, ""]  # (rad/s)^2: of M^(-1/2) F_q M^(-1/2)

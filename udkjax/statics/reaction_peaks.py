@@ -61,7 +61,7 @@ Peaks = dict[str, dict[str, Peak]]  # by joint or driver, and body
 
 
 class RestingPositions(NamedTuple):
-    """Positions over time, at rest: q and v (T, bodies, 3)."""
+    """Positions of rest in the form of a motion: times (T,), q and zero velocities v (T, bodies, 3)."""
 
     ts: Any
     q: Any
@@ -121,7 +121,10 @@ def pin_reactions(
 
 
 def unique_pin_forces(mechanism: Mechanism, solution: StateHistory) -> dict[str, dict[str, bool]]:
-    """Return, by pin and body, whether equilibrium alone determines the force at all times: see `unique_reactions`."""
+    """Return True, by pin and body, if equilibrium alone determines the force at all times that are reached, else False.
+
+    See `unique_reactions`.
+    """
     by_pin: dict[str, dict[str, bool]] = {}
     unique, is_reached = unique_reactions(mechanism, solution), np.isfinite(np.asarray(solution.q)).all((1, 2))
     for name, joint in mechanism.joints.items():
@@ -157,7 +160,7 @@ def cam_forces(mechanism: Mechanism, solution: StateHistory) -> dict[str, Float[
 
 
 def _pin_of(mechanism: Mechanism, joint: str) -> str:
-    """Return the first joint at the pin of a revolute: its name without the number that drawings append."""
+    """Return the name of the pin of a joint: that of the first joint there, without the number that drawings append to others."""
     base, _, number = joint.rpartition("-")
     pair = [mechanism.joints.get(name) for name in (base, joint)]
     return base if number.isdigit() and all(isinstance(joint_of_pair, Revolute) for joint_of_pair in pair) else joint

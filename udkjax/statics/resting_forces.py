@@ -24,9 +24,9 @@ class RestingForces(NamedTuple):
 
 
 def resting_forces(mechanism: Mechanism, q: ArrayLike, t: NumberLike) -> RestingForces:
-    """Return the forces in a position of rest (bodies, 3), with the drivers halted at time t (s).
+    """Return the forces that hold a mechanism at rest in a position q (bodies, 3), with the drivers halted at time t (s).
 
-    Without gravity, links may have no mass: forces that equilibrium determines do not depend on it.
+    Without gravity, links need no mass: forces that equilibrium determines do not depend on it.
     """
     if mechanism.massless and not has_gravity(mechanism):
         mechanism = mechanism.with_parameters({f"body.{name}.mass": mechanism.bodies[name].mass for name in mechanism.massless})
@@ -39,12 +39,15 @@ def resting_forces(mechanism: Mechanism, q: ArrayLike, t: NumberLike) -> Resting
 
 
 def has_gravity(mechanism: Mechanism) -> bool:
-    """Return whether links weigh anything; the gravity of the mechanism is concrete."""
+    """Return True if the mechanism has gravity, which must be concrete."""
     return bool(np.any(np.asarray(mechanism.gravity) != 0.0))
 
 
 def forces_table(mechanism: Mechanism, q: ArrayLike) -> PrintedTable | None:
-    """Return the table of the forces at rest in a position (bodies, 3); None if nothing acts or a link can move."""
+    """Return the table of the forces at rest in a position (bodies, 3); None without forces and gravity, or if a link can move.
+
+    If links have weight but no mass, the table has only a title that asks for masses, or is None without force elements.
+    """
     is_loaded = bool(mechanism.forces)
     if not (is_loaded or has_gravity(mechanism)) or analyse(mechanism).degrees_of_freedom != 0:
         return None
@@ -64,13 +67,13 @@ def forces_table(mechanism: Mechanism, q: ArrayLike) -> PrintedTable | None:
 
 
 def _effort(mechanism: Mechanism, name: str, effort: Any, scale: float) -> str:
-    """Return the effort of a driver as text; 0 if it is a rounding error beside forces of a size (N)."""
+    """Return the effort of a driver as text with its unit; rounding errors relative to forces of the size `scale` (N) are 0."""
     unit = mechanism.drivers[name].effort_unit
     return format_number(effort, unit, scale if unit == "N" else scale * float(analyse(mechanism).length))
 
 
 def force_lines(mechanism: Mechanism, held: RestingForces) -> str:
-    """Describe the forces: one line for each driver, and for each pin and body."""
+    """Return the forces as text, with a line for each driver, and for each pin and body."""
     loads = [load[:2] for on in held.forces.values() for load in on.values()]
     scale = float(np.max(np.abs(loads), initial=0.0))
     rows = [(f"{name} holds by", _effort(mechanism, name, x, scale)) for name, x in held.efforts.items()]

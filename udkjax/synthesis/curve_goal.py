@@ -125,13 +125,13 @@ class CurveGoal(Goal):
         return CombinedResiduals(r, np.zeros_like(by_value), slopes, rest)
 
     def report(self, r: np.ndarray) -> np.ndarray:
-        """Return the roots (J, 2) of the parts of the loss: of positions, and of as many pieces of the curve."""
+        """Return the roots (J, 2) of the parts of the loss: those of the J positions, and those of J pieces of the curve."""
         found = self._compare(r[None])
         of_curve = found.of_target[0].reshape(self.samples, FINENESS).sum(1)
         return self.scale * np.sqrt(np.stack([found.of_curve[0], of_curve], 1))
 
     def distances(self, residuals: np.ndarray) -> np.ndarray:
-        """Return the distances (J,) (m) of pieces of the curve from the drawn one, from the residuals (J, 2) of a design."""
+        """Return the distances (J,) (m) of pieces of the wanted curve from the drawn one, by the residuals (J, 2) of a design."""
         rho = self.samples * (residuals[:, 1] / self.scale) ** 2
         return self.scale * np.sqrt((rho + BLUR) ** 2 - BLUR**2)
 

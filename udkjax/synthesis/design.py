@@ -104,7 +104,7 @@ class DesignSearch:
         return other
 
     def __call__(self, starts: int = 300, seed: int = 0, results: int = 5, threads: int | None = None) -> Designs:
-        """Search from random mechanisms; return the best different ones.
+        """Return the best different designs of a search from random mechanisms.
 
         Args:
             starts: number of mechanisms to start from.
@@ -127,7 +127,7 @@ class DesignSearch:
 
 
 def search(problem: DesignProblem, state: SearchState, threads: int | None) -> SearchState:
-    """Improve the best trials, stage by stage."""
+    """Return the final state of a search: from stage to stage fewer trials, the best, are improved; the last are polished."""
     shares = [share for _, share in STAGES]
     for share, (steps, _) in zip(shares, STAGES[1:], strict=False):
         count = max(FEWEST, int(share * len(state.merit)))
@@ -154,7 +154,7 @@ def design(
     seed: Annotated[int, NOT_NEGATIVE_COUNT] = 0,
     results: int = 5,
 ) -> Designs:
-    """Find mechanisms with the structure of a drawing that meet a goal, by least squares from many starts.
+    """Return mechanisms with the structure of a drawing that meet a goal, found by least squares from many starts.
 
     Random mechanisms within the bounds are turned once. The best, moved and scaled to the goal as a whole if their pins are
     free, are improved by the Levenberg-Marquardt method, in batches of compiled machine code, with exact derivatives with
@@ -180,7 +180,7 @@ def design(
         results: largest number of designs to return.
 
     Returns:
-        `Designs`, the best first; empty if nothing was found within the limits.
+        A `Designs`, the best first; empty if nothing was found within the limits.
 
     Raises:
         SceneError: names, bounds or lengths are wrong, positions do not follow from the driver, or machine code cannot evaluate
@@ -212,7 +212,7 @@ def _all_pins(mechanism: Mechanism) -> list[str]:
 
 
 def _places(mechanism: Mechanism, goal: Goal) -> np.ndarray:
-    """Return the places that determine the location and size of the search."""
+    """Return the places (k, 2) that determine the location and size of the region in which free pins are searched."""
     if goal.has_place:
         fixed = [] if mechanism.drawing is None else [np.asarray(p) for p in mechanism.drawing.pins.values()]
         size = np.ptp(goal.targets[:, :2], axis=0).max()

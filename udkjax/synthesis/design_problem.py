@@ -35,7 +35,7 @@ class DesignProblem:
     """A goal for a mechanism: its unknowns, and programs that evaluate trials.
 
     The unknowns x are the free numbers, the start of the driver's values if it is free, and further unknowns of the goal. Lengths
-    and the transmission are limited; the transmission at all positions, or over the whole turn if it is required.
+    and the transmission are limited: the transmission at all positions, or over the whole turn if a turn is required.
     """
 
     def __init__(
@@ -69,7 +69,7 @@ class DesignProblem:
         self._require_effects()
 
     def _aim(self, goal: Goal, bounds: Bounds):
-        """Set the targets, and the ranges and scales that go with them."""
+        """Set the goal with its targets, and the ranges and scales of unknowns that depend on the goal."""
         self.goal, self.data, self.scale = goal, goal.targets, goal_scale(goal, self.mechanism)
         length = self.scale if goal.has_place else float(self.driven.analysis.scales.length)
         self._unit = np.tile([length, length, 1.0], self.coordinates // 3)
@@ -135,7 +135,7 @@ class DesignProblem:
 
     @cached_property
     def _margin(self):
-        """Programs of the transmission and its derivatives."""
+        """The programs of the transmission and its derivatives, and their machine code."""
         return self._made(slice(0, 0), True)
 
     def _require_effects(self):
@@ -185,7 +185,10 @@ class DesignProblem:
         return any(link.outline is not None or link.centre is not None for link in links.values())  # pyright: ignore
 
     def signature(self, x: np.ndarray, q: np.ndarray) -> np.ndarray:
-        """Return the points of links in a position; they are equal for trials of the same mechanism, however drawn."""
+        """Return the points of links in a position q (n,) of a trial x (P,), which are equal for trials of the same mechanism.
+
+        Without a drawing, these are the coordinates and the scaled free numbers.
+        """
         points = self._at(x, q[None])[0, self._measured :]
         if not self._pins:  # free numbers, in the unit of lengths
             points[len(points) - self.free.count :] *= self.scale / self.sizes
@@ -217,7 +220,7 @@ class DesignProblem:
     # --- values of the driver
 
     def values_at(self, x: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """Return the driver's values (M, J) of trials, which may depend on further unknowns."""
+        """Return the driver's values (M, J) of trials x: `values`, unless the goal computes them from its own unknowns."""
         return self.goal.values_at(x[:, self.free.count + self.shifted :], values)
 
     def value_drawn(self, x: np.ndarray) -> np.ndarray:
@@ -225,7 +228,7 @@ class DesignProblem:
         return np.asarray(self._fit.drawn_value.by_numpy(list(x.T))[0])
 
     def turn(self, x: np.ndarray, values: int = TURN_VALUES, threads: int | None = None) -> Turn:
-        """Turn the driver once from the drawn position."""
+        """Return a turn of the driver of trials x (M, P) from the drawn position, at `values` + 1 values."""
         s = self.value_drawn(x)[:, None] + self.period * np.linspace(0.0, 1.0, values + 1)
         solved = self._turn_code(x, s, self._unit, longest=self.longest, threads=threads)
         return Turn(s, solved.out[..., :-1], solved.q, solved.out[..., -1], np.isfinite(solved.end))
@@ -242,7 +245,7 @@ class DesignProblem:
 
     @property
     def longest(self) -> float:
-        """The longest step of the driver's value."""
+        """The longest step of the driver's value (rad, m) when machine code follows positions."""
         return CLOSURE.longest_step * float(self.driven.unit)
 
     def march(self, x: np.ndarray, s: np.ndarray, threads: int | None = None) -> tuple[np.ndarray, np.ndarray]:
@@ -286,13 +289,17 @@ class DesignProblem:
         threads: int | None = None,
         worth: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None,
     ) -> TrialResiduals:
-        """Evaluate residuals and limits of trials. Closing of positions starts from the positions stored in the trials.
+        """Return the residuals and limits of trials. Closing of positions starts from the positions stored in the trials.
 
-        `worth` selects trials by losses and limits of lengths before their turns are computed; the others are marked as not
-        existing.
-
-        The rows of limits are those of lengths, then margin (M,) - tau^2 with the transmission tau. The square is used because it
+        The rows of limits are those of lengths, then margin - tau^2 with the transmission tau. The square is used because it
         varies linearly with the lengths where branches meet.
+
+        Args:
+            trials: the trials.
+            margin: the least squared transmission of each trial (M,).
+            threads: number of threads; None: the default.
+            worth: returns a mask of the trials whose turns are computed, from losses (M,) and limits of lengths; the others are
+                marked as not existing.
         """
         x, (members, J) = trials.x, trials.s.shape
         solved = self._fit_code(x, trials.s, self._unit, self.data, trials.q, threads=threads)
@@ -319,7 +326,7 @@ class DesignProblem:
         return TrialResiduals(solved.q, *found, exists)
 
     def _terms_of(self, x: np.ndarray, exists: np.ndarray, threads: int | None) -> tuple[np.ndarray, np.ndarray]:
-        """Return the residuals of motion goals and their derivatives; trials without a motion are marked in `exists`."""
+        """Return the residuals of motion goals and their derivatives; `exists` becomes False for trials without a motion."""
         count = sum(term.goal.samples for term in self.terms)
         r, by_unknowns, start = np.zeros((len(x), count)), np.zeros((len(x), count, self.unknowns)), 0
         for term in self.terms:
@@ -334,7 +341,7 @@ class DesignProblem:
         return solved.out[..., :-1], self.lengths(trials.x)[0], np.isfinite(solved.end).all(1)
 
     def _turn_limit(self, x: np.ndarray, margin: np.ndarray, threads: int | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the limit row of the least transmission of a turn, its derivative, and whether the turn is complete.
+        """Return the limit row of the least transmission of a turn, its derivative, and a mask of the trials that turn fully.
 
         The minimum of tau^2 is that of a parabola through three values of the turn, corrected once by the slope there.
         """

@@ -22,7 +22,7 @@ AGREEMENT = 1e-6  # tolerance between the losses of search and motion, relative 
 
 
 class FoundDesign(FoundMechanism):
-    """A design that meets the goal, drawn at the first position of the goal if its pins are free.
+    """One design that a search has found; it is drawn at the first position of the goal if all of its moving pins are free.
 
     Attributes:
         loss: the sum of the squared residuals of its motion (m^2; for a function rad^2 or m^2).
@@ -62,7 +62,7 @@ class FoundDesign(FoundMechanism):
 
 
 class Designs(PrintsTable):
-    """Different mechanisms that meet a goal, the best first: a sequence of `FoundDesign`.
+    """Different mechanisms found for a goal, the best first: a sequence of `FoundDesign`.
 
     Attributes:
         found: the designs.
@@ -96,7 +96,15 @@ class Designs(PrintsTable):
 
 
 def verified(problem: DesignProblem, x: np.ndarray, s: np.ndarray, q: np.ndarray, loss: float) -> FoundDesign | None:
-    """Return a trial as a design verified by its motion; None if the motion does not confirm the loss."""
+    """Return a trial as a design verified by its motion; None if the motion does not confirm the loss or a required turn.
+
+    Args:
+        problem: the problem.
+        x: the unknowns of the trial (P,).
+        s: the driver's values at the positions of the goal (J,).
+        q: the positions (J, n).
+        loss: the loss of the trial.
+    """
     turns = problem.turns(x)
     if problem.rotation and not turns:
         return None
@@ -137,13 +145,16 @@ def verified(problem: DesignProblem, x: np.ndarray, s: np.ndarray, q: np.ndarray
 
 
 def follow(mechanism: Mechanism, driver: Drive, values: np.ndarray) -> np.ndarray | None:
-    """Return positions (J, bodies, 3) of a motion from the drawn position at values; None if some are not reached."""
+    """Return positions (J, bodies, 3) at the driver's values, followed from the drawn position; None if one is not reached."""
     motion = kinematics(mechanism, driver, values)
     return np.asarray(motion.q) if np.all(motion.reached) else None
 
 
 def redrawn(problem: DesignProblem, mechanism: Mechanism, q: np.ndarray) -> Mechanism:
-    """Return the mechanism drawn in a position if all of its moving pins are free; otherwise unchanged."""
+    """Return the mechanism drawn in the position q (bodies, 3) if all of its moving pins are free.
+
+    Otherwise, or if a link has an outline or a centre in world coordinates, return the mechanism itself.
+    """
     drawing = mechanism.drawing
     if drawing is None:
         return mechanism

@@ -23,10 +23,10 @@ class Deviation(NamedTuple):
 
     Attributes:
         largest: the largest distance of a target from the motion, or difference of an output (m, rad).
-        extent: length of the path, or range of the outputs (m, rad).
-        angle: of a link through poses, the largest difference of its angle (rad); else None.
-        unit: m or rad.
-        size: the extent of the targets in the plane, or the range of the outputs, of which a tenth is accepted.
+        extent: the length of the path through the targets, or the range of the outputs (m, rad).
+        angle: for a `PoseGoal`, the largest difference of the link's angle (rad); otherwise None.
+        unit: the unit of `largest` and `extent`, "m" or "rad".
+        size: the extent of the targets in the plane, or the range of the outputs, of which a tenth is accepted (m, rad).
     """
 
     largest: float

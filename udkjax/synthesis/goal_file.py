@@ -123,7 +123,10 @@ def read_design(path: str | os.PathLike[str]) -> DesignSearch | CompleteSearch:
 
 
 def _with_table(goal: Any, folder: Path, problems: list[str]) -> Any:
-    """Return a goal with its targets as numbers, read from a table if it names one; a function's table has its values, too."""
+    """Return a goal's entries, with the contents of a file in place of the name of a file of targets or of points of a curve.
+
+    A table of a function has the values of the driver in its first column. Other goals are returned unchanged.
+    """
     if isinstance(goal, Mapping) and goal.get("kind") == "curve" and isinstance(goal.get("points"), str):
         try:
             return {**goal, "points": read_curve_file(folder / goal["points"]).tolist()}
@@ -204,7 +207,10 @@ def _read_motion(
 def _read_robust(
     where: str, mechanism: Mechanism, goal: Goal | None, table: TomlTable, units: Units, problems: list[str]
 ) -> MotionTerm | None:
-    """Return a robust goal of the motion goal in `goal`, or of the positional goal."""
+    """Return the robust goal of a table: of the motion goal in its entry `goal` or, without one, of the positional goal.
+
+    Mistakes are appended to `problems`; the result is then None.
+    """
     before = len(problems)
     problems += [f"{where}.{key}: {unknown_key(key, ROBUST_KEYS)}" for key in table if key not in ROBUST_KEYS]
     plain = _read_motion(f"{where}.goal", mechanism, None, table["goal"], units, problems) if "goal" in table else goal
@@ -228,7 +234,7 @@ def _read_robust(
 
 
 def _missing(where: str, make: Callable[..., Any], given: TomlTable) -> list[str]:
-    """Return a mistake for each required key that is missing."""
+    """Return a message for each argument that `make` requires and `given` lacks."""
     needed = [key for key, value in inspect.signature(make).parameters.items() if value.default is value.empty]
     return [f"{where}.{key}: missing" for key in needed if key not in given]
 

@@ -54,7 +54,10 @@ def _values(value: Numbers | None) -> np.ndarray | None:
 
 
 class CombinedResiduals(NamedTuple):
-    """Residuals (M, J, G) of M trials, derivatives with respect to values and unknowns, and the rest of their losses (M,)."""
+    """Residuals r (M, J, G) of M trials, and their derivatives by the driver's values and by the unknowns.
+
+    `rest` (M,) is the part of each loss that is not a sum of squares of residuals.
+    """
 
     r: np.ndarray
     by_value: np.ndarray
@@ -94,12 +97,12 @@ class Goal(PrintsTable):
 
     @property
     def extras(self) -> int:
-        """The number of further unknowns, in addition to the start of values."""
+        """The number of unknowns of the goal itself, in addition to free numbers and the start of values."""
         return 0
 
     @property
     def bounds_of_extras(self) -> tuple[float, float]:
-        """The limits of the further unknowns."""
+        """The lower and the upper limit of the goal's own unknowns."""
         return -np.inf, np.inf
 
     @property
@@ -113,15 +116,21 @@ class Goal(PrintsTable):
         return False
 
     def combine(self, r: np.ndarray, by_value: np.ndarray, by_unknowns: np.ndarray) -> CombinedResiduals:
-        """Return the residuals of trials (M, J, G) whose squares, with the rest, are the loss; by default those of positions."""
+        """Return residuals of trials whose squares, plus a rest, are the losses; by default the given residuals, without a rest.
+
+        Args:
+            r: residuals of all positions (M, J, G).
+            by_value: derivatives of r by the driver's values (M, J, G).
+            by_unknowns: derivatives of r by the unknowns (M, J, G, P).
+        """
         return CombinedResiduals(r, by_value, by_unknowns, np.zeros(len(r)))
 
     def report(self, r: np.ndarray) -> np.ndarray:
-        """Return the residuals (J, G) of a design, whose squares are its loss."""
+        """Return the residuals (J, G) that a design reports, whose squares are its loss; by default those of positions, r."""
         return r
 
     def values_at(self, extras: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """Return the driver's values (M, J) of trials with further unknowns (M, extras), from the values before."""
+        """Return the driver's values (M, J) of trials, from the goal's own unknowns (M, extras); by default `values`."""
         return values
 
     @abstractmethod
@@ -134,10 +143,17 @@ class Goal(PrintsTable):
 
     @abstractmethod
     def residual(self, measured: NumericArray, target: NumericArray, extras: NumericArray, xp: ModuleType) -> list[NumericArray]:
-        """Return the differences between measures (..., G) and a target, as a list of G arrays."""
+        """Return the differences between measures and a target as a list of arrays (...), one for each residual.
+
+        Args:
+            measured: the measures (..., G).
+            target: the row of `targets` (..., columns).
+            extras: the goal's own unknowns (..., extras).
+            xp: NumPy or jax.numpy.
+        """
 
     def origin(self, mechanism: Mechanism) -> Array:
-        """Return the value of the driver that `values` count from."""
+        """Return the value of the driver (rad, m) from which `values` are measured: the angle of `line`, or zero."""
         if not self.line:
             return jnp.zeros(())
         pins = mechanism.drawing.pins  # pyright: ignore[reportOptionalMemberAccess, reportAttributeAccessIssue]
@@ -157,7 +173,7 @@ class Goal(PrintsTable):
 
 
 def place_of(mechanism: Mechanism, of: str, point: Numbers | None, q: Float[Array, "bodies 3"]) -> list[Array]:
-    """Return x and y (m) of a pin in a position, or of a body's point in its own frame."""
+    """Return x and y (m), in ground axes, of a pin, or of a point given in the frame of a body, in the position q."""
     body, local = locate(mechanism, of, point)
     if body == GROUND:
         return [jnp.asarray(local[0]), jnp.asarray(local[1])]
@@ -274,8 +290,8 @@ class FunctionGoal(Goal):
         output: the coordinate, such as `body.rocker.angle`, named as for `kinematics`.
         values: values of the driver (rad, m).
         targets: the output at each value (rad, m).
-        start: "free": the driver's values count from one found by the search.
-        output_start: "free": likewise for the output.
+        start: "free": the driver's values count from a value found by the search; "given": from zero.
+        output_start: "free": the targets count from an output found by the search; "given": from zero.
         line: as in a `PathGoal`.
     """
 

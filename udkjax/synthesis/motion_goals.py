@@ -71,13 +71,13 @@ def _float(x: Any) -> Any:
 
 
 class MotionTerm(PrintsTable):
-    """A goal for a motion; see the module.
+    """A motion goal: limits on a measure of the positions of a motion, in addition to a positional goal.
 
     Args:
         most: upper limit of the measure, positive.
         least: lower limit of the measure, positive.
         speed: the rate of the driver (rad/s, m/s); by default that of its motion at time 0.
-        weight: exceeding the limit by 100 % costs as much as missing a place by `weight` scales of the positional goal.
+        weight: to exceed the limit by 100 % costs as much as to miss a place by `weight` scales of the positional goal.
         samples: number of measured positions.
     """
 
@@ -99,18 +99,24 @@ class MotionTerm(PrintsTable):
 
     @property
     def positional(self) -> Goal | None:
-        """The positional goal whose targets are measured, if any."""
+        """The positional goal whose targets this goal measures; None if it measures no targets."""
         return None
 
     def check(self, mechanism: Mechanism, driven: Driven, free: Sequence[str]) -> None:
-        """Raise `SceneError` if the mechanism lacks the measured element."""
+        """Raise `SceneError` if the mechanism lacks the measured element; by default nothing is checked.
+
+        Args:
+            mechanism: the mechanism.
+            driven: the mechanism as driven by its driver.
+            free: the names of the free numbers.
+        """
 
     def loads(self, at: MotionPoint) -> Float[Array, "k n"]:
         """Return the right-hand sides b of systems Psi_q^T y = b needed by the measure; their solutions y are `at.loads`."""
         return jnp.zeros((0, at.q.size))
 
     def measure(self, at: MotionPoint) -> Float[Array, ""]:
-        """Return the measure of a position."""
+        """Return the measure of a position; every motion goal overrides this method."""
         raise NotImplementedError
 
     def residual(self, measure: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]:

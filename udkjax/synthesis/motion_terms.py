@@ -32,7 +32,7 @@ class TermResiduals(NamedTuple):
 
 
 class CompiledTerm:
-    """A motion goal of a design.
+    """A compiled motion goal, which evaluates residuals and derivatives of batches of trials.
 
     Args:
         goal: the goal.
@@ -125,7 +125,7 @@ class CompiledTerm:
         return TermResiduals(r, slope[..., None] * by_unknowns, exists)
 
     def residual(self, measures: np.ndarray) -> np.ndarray:
-        """Return the residuals of measures (K,)."""
+        """Return the residuals (K,) for measures (K,)."""
         return self.goal.residual(measures, self._unit_of_residuals)[0]
 
     def values(self, x: np.ndarray) -> np.ndarray:
@@ -142,7 +142,7 @@ class CompiledTerm:
     def measure_motion(
         self, mechanism: Mechanism, x: np.ndarray, origin: float, s: np.ndarray | None = None
     ) -> np.ndarray | None:
-        """Return the measures (K,) of a mechanism's motion by `kinematics`; None if it does not reach them.
+        """Return the measures (K,) of a mechanism's motion by `kinematics`; None if the motion does not reach all values.
 
         Args:
             mechanism: the mechanism.

@@ -20,7 +20,7 @@ CONVERGED = 1e-13  # predicted relative decrease of the merit
 
 
 def polish(problem: DesignProblem, state: SearchState, steps: int, threads: int | None = None) -> SearchState:
-    """Improve all trials of a state by at most `steps` Newton steps."""
+    """Improve all trials of a state by at most `steps` Newton steps; return the state, which is changed in place."""
     members, sign = len(state.merit), np.sign(state.found.transmission[:, 0])
     shift, done = np.full(members, FIRST_SHIFT), ~state.found.exists
     for _ in range(steps):
@@ -83,7 +83,7 @@ def _newton_step(
 
 
 def _downhill(problem: DesignProblem, trials: Trials, H: np.ndarray, g: np.ndarray, shift: np.ndarray) -> np.ndarray:
-    """Return the step of each trial; unknowns that would leave their bounds are fixed."""
+    """Return the steps dz (M, N) of trials by their Hessians H, gradients g and shifts; unknowns at bounds may be fixed."""
     fixed = np.zeros(g.shape, bool)
     of_x = g[:, : problem.unknowns]
     fixed[:, : problem.unknowns] = ((trials.x <= problem.low) & (of_x > 0)) | ((trials.x >= problem.high) & (of_x < 0))

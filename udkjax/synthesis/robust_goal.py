@@ -1,7 +1,8 @@
 """The goal that a measure stays within its limit in most of the pieces that are made, with exact derivatives.
 
-Mean and variance of a measure are those of the quadratic function through its values at a few pieces (second_order.py). Both are
-functions of these values alone, so that their derivatives follow from those of the measure at each piece, by its own program.
+A piece is a mechanism as made, whose numbers deviate from the design. Mean and variance of a measure are those of the quadratic
+function through its values at a few pieces (second_order.py). Both are functions of these values alone, so that their derivatives
+follow from the derivatives of the measure at each piece, which the compiled program of the measure computes.
 """
 
 from collections.abc import Mapping
@@ -40,7 +41,7 @@ class RobustGoal(MotionTerm):
             other numbers; neither pins of the drawing nor clearances. Grades are those of the drawn lengths.
         sigmas: number of standard deviations.
         most: the limit of the distance from the targets; a motion goal has its own.
-        weight: of the limit of the distance, as for motion goals; a motion goal has its own.
+        weight: the weight of this limit, as for motion goals; a motion goal has its own.
     """
 
     goal: MotionTerm | Goal
@@ -88,7 +89,7 @@ class RobustGoal(MotionTerm):
         return self.goal.loads(at) if isinstance(self.goal, MotionTerm) else super().loads(at)
 
     def measure(self, at: MotionPoint) -> Array:
-        """Return the measure of one piece; of targets, the square of the distance."""
+        """Return the measure of one piece; for a positional goal, the square of the distance from its target."""
         if isinstance(self.goal, MotionTerm):
             return self.goal.measure(at)
         residual = self.goal.residual(self.goal.measure(at.mechanism, at.q), at.target, at.extras, jnp)
@@ -96,7 +97,7 @@ class RobustGoal(MotionTerm):
 
 
 class MadePieces:
-    """A mechanism as made: a function of free numbers x (P,) and deviations u (K,) of unit variance; vectors hold x before u.
+    """The pieces of a mechanism, by vectors z = (x, u) of free numbers x (P,) and deviations u (K,) of unit variance.
 
     Args:
         free: the free numbers.
@@ -142,11 +143,11 @@ class MadePieces:
         self.count = free.count + len(sources)
 
     def moved(self, z: Array) -> Mechanism:
-        """Return the piece with these numbers and deviations, which may be traced."""
+        """Return the piece with the free numbers and deviations z = (x, u), which may be traced."""
         return self.piece(self._free.moved(z[: self._free.count]), z[self._free.count :])
 
     def piece(self, mechanism: Mechanism, u: Any) -> Mechanism:
-        """Return a mechanism with the deviations u."""
+        """Return the mechanism with its numbers changed by the deviations u."""
         changes, count = self._middle + self._sizes * (self._owners @ jnp.asarray(u)), self._toleranced.count
         known, values = mechanism.parameters(), {}
         for name, change in self._toleranced.split(changes[:count]).items():
@@ -177,12 +178,15 @@ class RobustTerm(CompiledTerm):
         self._parts = factors[:, None] * np.concatenate([model.slope.T, own, pairs])
 
     def _note(self, u: Float[np.ndarray, "E K"]) -> np.ndarray:
-        """Keep the points of the differences, with unit values of each."""
+        """Store the E points at which `quadratic` evaluates its function; return the unit matrix as values.
+
+        The quadratic function of these values has the weights of the values at all points.
+        """
         self._points = u
         return np.eye(len(u))
 
     def _at_points(self, x: np.ndarray) -> np.ndarray:
-        """Return the numbers of all pieces (M E, P + K) of trials (M, P)."""
+        """Return the unknowns of all pieces of M trials, with their deviations after the free numbers: E rows for each trial."""
         M, E, P = len(x), len(self._points), self._numbers
         parts = np.repeat(x[:, None, :P], E, 1), np.tile(self._points, (M, 1, 1)), np.repeat(x[:, None, P:], E, 1)
         found = np.concatenate(parts, 2)

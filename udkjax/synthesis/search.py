@@ -32,7 +32,21 @@ MOST_BEND = 0.75  # largest 2 |acceleration| / |step|
 
 @dataclass
 class SearchState:
-    """Active trials with their residuals, multipliers, weights, margins and dampings."""
+    """M trials of a search.
+
+    Attributes:
+        trials: the trials.
+        found: their residuals and limits.
+        multipliers: the multipliers u of limits (M, K).
+        weight: the weight w of limits (M,).
+        margin: the least squared transmission for the present (M,).
+        least: the least transmission that is requested (M,).
+        damping: the damping of steps (M,).
+        merit: the loss plus the penalty of limits (M,); infinite for trials without positions.
+        settled: whether a trial has converged (M,).
+        kept: the best version of each trial that was within all limits.
+        kept_loss: the loss of this version (M,); infinite if there was none.
+    """
 
     trials: Trials
     found: TrialResiduals
@@ -47,20 +61,20 @@ class SearchState:
     kept_loss: np.ndarray
 
     def take(self, which: np.ndarray) -> "SearchState":
-        """Return the selected trials."""
+        """Return the state of the trials that `which`, a mask or indices, selects."""
         arrays = ((field.name, getattr(self, field.name)) for field in fields(self))
         selected: dict[str, Any] = {name: a[which] if isinstance(a, np.ndarray) else a.take(which) for name, a in arrays}
         return SearchState(**selected)
 
     def accept(self, problem: DesignProblem, which: np.ndarray, trials: Trials, found: TrialResiduals, merit: np.ndarray):
-        """Replace some trials by accepted ones, and store the best version of each trial within all limits."""
+        """Replace the trials `which` by accepted steps, with their residuals and merits, and call `keep`."""
         for a, b in zip((*self.trials, *self.found), (*trials[:2], found.q, *found), strict=True):
             a[which] = b
         self.merit[which] = merit
         self.keep(problem, which)
 
     def keep(self, problem: DesignProblem, which: np.ndarray):
-        """Store trials within all limits if they are better than the stored ones."""
+        """Store those of the trials `which` in `kept` that are within all limits and better than their stored versions."""
         found = self.found.take(which)
         loss = np.where(found.exists & (self.excess(problem, which) <= 0), loss_of(found), np.inf)
         better = loss < self.kept_loss[which]
@@ -69,19 +83,19 @@ class SearchState:
         self.kept_loss[which[better]] = loss[better]
 
     def excess(self, problem: DesignProblem, which: np.ndarray) -> np.ndarray:
-        """Return the largest excess of some trials over the requested limits (m)."""
+        """Return the largest excess of each of the trials `which` over the requested limits (m); negative within them."""
         limits, more = self.found.limits[which], self.margin[which] - self.least[which] ** 2
         limits[:, problem.lengths.count :] -= MARGIN_WEIGHT * problem.scale * more[:, None]
         return np.max(limits, axis=1, initial=-np.inf)
 
 
 def loss_of(found: TrialResiduals) -> np.ndarray:
-    """Return the sum of the squares of all residuals (M,), and the rest of the losses."""
+    """Return the losses (M,): the sums of the squares of all residuals, plus the parts that are not squares."""
     return np.einsum("mjg,mjg->m", found.r, found.r) + np.einsum("mt,mt->m", found.terms, found.terms) + found.rest
 
 
 def improve(problem: DesignProblem, state: SearchState, steps: int, threads: int | None = None) -> SearchState:
-    """Improve trials by at most `steps` steps; trials without positions have an infinite merit."""
+    """Improve the trials of a state by at most `steps` steps; return the state, which is changed in place."""
     sign = np.sign(state.found.transmission[:, 0])
     for _ in range(steps):
         active = np.flatnonzero(~state.settled)
@@ -149,7 +163,7 @@ def _stepped(problem: DesignProblem, trials: Trials, dx: np.ndarray, ds: np.ndar
 
 
 def _bent_step(problem: DesignProblem, equations: StepEquations, threads: int | None) -> tuple[np.ndarray, np.ndarray]:
-    """Return steps plus half of their acceleration, unless it is long relative to the step."""
+    """Return steps dx and ds, to which half of their acceleration is added unless it is long relative to the step."""
     dx, ds = equations.find()
     if problem.goal.is_combined:  # its residuals are those of a quadratic model
         return dx, ds
@@ -169,7 +183,7 @@ def _bent_step(problem: DesignProblem, equations: StepEquations, threads: int | 
 
 
 def _settle(problem: DesignProblem, state: SearchState, done: np.ndarray):
-    """Mark converged trials; those with exceeded limits continue with new multipliers."""
+    """Mark the trials `done` as settled, except those that must continue: `harden` changes their limits, and damping falls."""
     restarted = done[must_continue(problem, state, done)]
     state.settled[done] = True
     harden(problem, state, restarted)
@@ -177,7 +191,7 @@ def _settle(problem: DesignProblem, state: SearchState, done: np.ndarray):
 
 
 def must_continue(problem: DesignProblem, state: SearchState, which: np.ndarray) -> np.ndarray:
-    """Return a mask of the converged trials that must continue, with changed limits."""
+    """Return a mask of the converged trials `which` that must continue: limits are exceeded, or the margin is still too large."""
     limits, u = state.found.limits[which], state.multipliers[which]
     wrong = np.max(np.abs(np.maximum(limits, -u)), axis=1, initial=0.0) > LIMIT_TOL * problem.scale
     rows = slice(problem.lengths.count, None)  # limits of transmission
@@ -197,13 +211,13 @@ def harden(problem: DesignProblem, state: SearchState, which: np.ndarray):
 
 
 def raise_weights(problem: DesignProblem, state: SearchState):
-    """Raise the weights of limits to match the remaining losses."""
+    """Raise the weights of the limits of all trials where they are too small for the remaining losses."""
     all_trials = np.arange(len(state.merit))
     _reweigh(problem, state, all_trials, np.maximum(state.weight, FIRST_WEIGHT * _height(problem, state, all_trials)))
 
 
 def _height(problem: DesignProblem, state: SearchState, which: np.ndarray) -> np.ndarray:
-    """Return the unit of the weights of some trials, which depends on their losses."""
+    """Return the unit of the weights of the trials `which`, at least 1 and proportional to the root of large losses."""
     return np.maximum(1.0, HIGH / problem.scale * np.sqrt(loss_of(state.found.take(which))))
 
 

@@ -37,7 +37,7 @@ class Selection(NamedTuple):
 
 
 def select(problem: DesignProblem, state: SearchState, results: int, threads: int | None) -> Selection:
-    """Return the best different designs from the final state of a search."""
+    """Return up to `results` of the best different designs, verified, from the final state of a search."""
     candidates = first = _within_limits(problem, state)
     losses = candidates.loss
     if not len(losses):
@@ -72,9 +72,9 @@ def _within_limits(problem: DesignProblem, state: SearchState) -> _Candidates:
 def _verify(
     problem: DesignProblem, candidates: _Candidates, results: int, found: list[tuple[FoundDesign, np.ndarray]], most: int
 ) -> np.ndarray:
-    """Add verified different designs to `found`, sorted; return the candidates with less loss than the best design.
+    """Add verified designs that differ to `found`, sorted by loss; return the indices of candidates better than the best design.
 
-    Verification stops after `most` refusals.
+    If none was refused, no index is returned. Verification stops after `most` refusals.
     """
     refused: list[np.ndarray] = []
     for k, loss in enumerate(candidates.loss):
@@ -97,7 +97,7 @@ def _verify(
 
 
 def _exceeded_limit(problem: DesignProblem, state: SearchState) -> str:
-    """Describe the limit that excludes the trial closest to all limits."""
+    """Return a message with the limit that the trial closest to all limits exceeds most."""
     present = np.flatnonzero(state.found.exists)
     if not len(present):
         return "no trial passes all positions of the goal in one motion: widen the bounds, or raise starts"

@@ -1,4 +1,4 @@
-"""Starts of searches: random mechanisms, turned once, moved and scaled to their targets, with driver values assigned in order.
+"""Starts of searches: random mechanisms, turned once, moved and scaled to the targets, with values of the driver for these.
 
 The curve of the moved, rotated and scaled mechanism follows from the curve of one turn: a place p becomes a p + b, in complex
 numbers. The best a and b for an assignment of values to targets solve a linear least-squares problem; the best assignment in
@@ -20,7 +20,7 @@ CLEAR = 0.02  # smallest transmission over the turn; mechanisms closer to a meet
 
 
 class _Fitted(NamedTuple):
-    """Assignments: indices of values in a turn (M, J), possibly beyond its ends, and remaining sums of squares (M,)."""
+    """Values assigned to targets, by their indices in a turn (M, J), which may exceed it, and remaining sums of squares (M,)."""
 
     places: np.ndarray
     cost: np.ndarray
@@ -64,7 +64,7 @@ def _assign(problem: DesignProblem, x: np.ndarray, turn: Turn) -> tuple[tuple[np
 
 
 def _best_phase(curve: np.ndarray, target: np.ndarray, moves: str, closed: bool) -> _Fitted:
-    """Assign values evenly over spans of a turn, in either direction, from the phase that fits best."""
+    """Return the best assignment of evenly spaced values to the targets, of several first values, spans and both directions."""
     J, K = len(target), curve.shape[1]
     spans = (1.0,) if closed else SPANS
     best = _Fitted(np.zeros((len(curve), J), int), np.full(len(curve), np.inf))
@@ -80,7 +80,10 @@ def _best_phase(curve: np.ndarray, target: np.ndarray, moves: str, closed: bool)
 
 
 def _move(z: np.ndarray, target: np.ndarray, moves: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return a, b (M,) of the best a z + b with the allowed `moves`, and the remaining sum of squares."""
+    """Return a and b (M,) for which curves a z + b fit the target best, with the allowed `moves`, and remaining sums of squares.
+
+    `moves` is that of `DesignProblem.can_move`.
+    """
     ones = np.ones(len(z), complex)
     if moves == "nothing":
         return ones, 0 * ones, np.sum(np.abs(z - target) ** 2, 1)
@@ -95,7 +98,7 @@ def _move(z: np.ndarray, target: np.ndarray, moves: str) -> tuple[np.ndarray, np
 
 
 def _in_order(curve: np.ndarray, target: np.ndarray, previous: np.ndarray) -> _Fitted:
-    """Return the best assignment in order, with the same direction and first value as `previous`."""
+    """Return the best assignment of values in order to targets, in the direction of `previous` and from about its first value."""
     M, K = curve.shape
     J, rows = len(target), np.arange(M)
     direction = np.where(previous[:, -1] >= previous[:, 0], 1, -1)
@@ -118,7 +121,10 @@ def _in_order(curve: np.ndarray, target: np.ndarray, previous: np.ndarray) -> _F
 
 
 def _spread(problem: DesignProblem, s: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return values over the part of the turn of assigned values (M, J), and the unknowns with its beginning and fraction."""
+    """Return the driver's values over the part of a turn that assigned values s (M, J) cover, and the unknowns x.
+
+    The unknowns that are the beginning of this part and its fraction of the turn are set.
+    """
     x, count = x.copy(), problem.free.count
     x[:, count] = s.min(1)
     low, high = problem.goal.bounds_of_extras
@@ -166,7 +172,7 @@ def _shift(problem: DesignProblem, x: np.ndarray, turn: Turn) -> tuple[tuple[np.
 
 
 def _interpolate(table: np.ndarray, index: np.ndarray) -> np.ndarray:
-    """Interpolate rows (M, J, G) of a table (M, K + 1, G) at fractional indices (M, J)."""
+    """Return rows (M, J, G) of a table (M, K + 1, G), interpolated at fractional indices (M, J)."""
     low = np.clip(np.floor(index).astype(int), 0, table.shape[1] - 2)
     lower, upper = (np.take_along_axis(table, k[..., None], 1) for k in (low, low + 1))
     return lower + (index - low)[..., None] * (upper - lower)

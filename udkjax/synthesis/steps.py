@@ -22,7 +22,16 @@ REGULAR = float(np.finfo(float).eps)  # regularization, relative to the largest 
 
 
 class StepEquations:
-    """The linear least-squares problem of a step of some trials; `find` solves it, `correct` solves it for other residuals."""
+    """The linear least-squares problem of a step of M trials; `find` solves it, `correct` solves it for other residuals.
+
+    Args:
+        problem: the problem.
+        trials: the trials.
+        found: their residuals.
+        multipliers: the multipliers u of limits (M, K).
+        weight: the weight w of the limits of each trial (M,).
+        damping: the damping of each trial (M,), relative to the diagonal.
+    """
 
     def __init__(
         self,
@@ -48,7 +57,7 @@ class StepEquations:
             self.A = self.A - (self.w / self.h[..., None]).transpose(0, 2, 1) @ self.w
 
     def find(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return changes dx (M, P), ds (M, J), limited in length; values stay in order."""
+        """Return the changes dx (M, P) of unknowns, limited in length, and ds (M, J) of the driver's values."""
         b, g = self._right_hand_side(self.found.r)
         b = b + (self.found.terms[:, None] @ self.found.terms_by_unknowns)[:, 0]
         members, P = b.shape
@@ -80,7 +89,7 @@ class StepEquations:
         return dx, self._values(dx, g)
 
     def correct(self, r: np.ndarray, limits: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return changes dx, ds that remove residuals r (M, J, G) and limits (M, K)."""
+        """Return the changes dx and ds that reduce other residuals r (M, J, G) and limits (M, K), with the matrices of `find`."""
         b, g = self._right_hand_side(r)
         force = self.weight[:, None] ** 2 * self.pressed * limits
         gradient = b + (force[:, None] @ self.found.limits_by_unknowns)[:, 0]
@@ -88,7 +97,7 @@ class StepEquations:
         return dx, self._values(dx, g)
 
     def length(self, dx: np.ndarray) -> np.ndarray:
-        """Return the length (M,) of changes, in the unit of residuals."""
+        """Return the length (M,) of changes dx of unknowns, in the unit of residuals."""
         return np.sqrt(np.sum(self.size * dx**2, axis=1))
 
     def _right_hand_side(self, r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -106,7 +115,7 @@ class StepEquations:
 
 
 def _held_out(matrix: np.ndarray, held: np.ndarray) -> np.ndarray:
-    """Return matrices with the rows and columns of fixed unknowns replaced by those of the unit matrix."""
+    """Return matrices (M, P, P) in which rows and columns of unknowns with `held` (M, P) are those of the unit matrix."""
     if not held.any():
         return matrix
     matrix = np.where(held[:, :, None] | held[:, None, :], 0.0, matrix)
@@ -115,7 +124,10 @@ def _held_out(matrix: np.ndarray, held: np.ndarray) -> np.ndarray:
 
 
 def in_order(problem: DesignProblem, ds: np.ndarray, s: np.ndarray) -> np.ndarray:
-    """Shorten changes of values to preserve their cyclic order over the period; the ends of a closed curve may coincide."""
+    """Return changes of the driver's values s, shortened to preserve the cyclic order of values over the period.
+
+    For a closed curve, the first and the last value may coincide.
+    """
     if not problem.local:
         return ds
     gap = np.abs(np.diff(s, axis=1))

@@ -52,7 +52,15 @@ class TrialResiduals(NamedTuple):
 
 
 class Turn(NamedTuple):
-    """A turn of the driver of M trials: values (M, K), measures (M, K, G), positions, transmission, and whether reached."""
+    """A turn of the driver of M trials at K values.
+
+    Attributes:
+        s: the driver's values (M, K).
+        measures: measures of the goal (M, K, G).
+        q: positions (M, K, n).
+        transmission: the transmission (M, K), with the sign of the branch.
+        reached: whether each value is reached (M, K).
+    """
 
     s: np.ndarray
     measures: np.ndarray

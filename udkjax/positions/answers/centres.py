@@ -18,7 +18,10 @@ from udkjax.scene.mechanism import Mechanism
 
 
 class InstantCentre(NamedTuple):
-    """The point (m) at which two links have the same velocity; at infinity, a direction (unit vector)."""
+    """The point at which two links have the same velocity.
+
+    `place` has its coordinates (m); if the point is at infinity, `place` is a unit vector towards it.
+    """
 
     place: Float[np.ndarray, "2"]
     at_infinity: bool
@@ -61,7 +64,7 @@ def instant_centres(
 
 
 def centres_table(mechanism: Mechanism, motion: Kinematics, counted: Count) -> PrintedTable:
-    """Return the table of the instant centres of all pairs of links in the first position of a motion."""
+    """Return the table of the instant centres of all pairs of links in the first position of a motion, in units of `counted`."""
     rows, unit, size = [], counted.units.shown("m"), counted.units.size("m")
     centres = instant_centres(mechanism, motion.q[0], motion.v[0])
     finite = [float(np.max(np.abs(place))) for place, at_infinity in centres.values() if not at_infinity]

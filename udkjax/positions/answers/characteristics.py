@@ -24,7 +24,7 @@ REFINEMENTS, REFINED = 6, 21  # of the extremes of pressure angles: rounds, and 
 
 
 class SpeedRatio(NamedTuple):
-    """An extreme speed of a link for one of the driver.
+    """The least or the largest speed of a link per unit speed of the driver.
 
     Attributes:
         ratio: the speed (rad or m) per rad of the driver, with its sign.
@@ -42,9 +42,10 @@ class Output(NamedTuple):
         kind: swings, slides or turns.
         extent: its swing angle (rad) or its stroke (m); for a link that turns all the way round, a whole turn.
         dead_points: the values of the driver (rad, m) at which it turns back.
-        time_ratio: of a link that turns back twice a turn: the driver's longer way between them over the shorter one, else None.
-        speed_ratios: the least and the largest speed for one of the driver, with their signs; None unless the driver makes whole
-            turns, because in its toggle positions the ratio has no limit.
+        time_ratio: for a link that turns back twice a turn of the driver, the driver's longer way between the dead points over
+            the shorter one; otherwise None.
+        speed_ratios: the least and the largest speed per unit speed of the driver, with their signs; None unless the driver makes
+            whole turns, because in its toggle positions the ratio has no limit.
     """
 
     kind: str
@@ -65,7 +66,7 @@ class Characteristics(PrintsTable):
         outputs: the motions of the links on the ground, by name.
         transmission_angles: by pin, the least and the largest acute angle between coupler and output (rad).
         pressure_angles: by cam, the least and the largest pressure angle (rad).
-        ratios: by link, its angular velocity for one of the driver, in a gear train.
+        ratios: by link, its angular velocity per unit angular velocity of the driver, if it is constant; empty without gears.
         count: the zero and the units in which values of the driver are shown.
     """
 
@@ -80,7 +81,7 @@ class Characteristics(PrintsTable):
     count: Count = eqx.field(static=True)
 
     def lines(self) -> dict[str, str]:
-        """Return the characteristics as texts by title, in the units of the drawing, counted as in the drawing."""
+        """Return the characteristics as texts by title, in the units of the drawing; `count` shows values of the driver."""
         count = self.count
         lines = {"mobility": self.mobility.words}
         lines |= {_numbered("type", k, len(self.four_bars)): bar.words for k, bar in enumerate(self.four_bars)}
@@ -107,7 +108,7 @@ class Characteristics(PrintsTable):
         return lines
 
     def _speed_words(self, output: Output) -> str:
-        """Return the least and the largest speed ratio as text, with the places of the driver."""
+        """Return the least and the largest speed ratio as text, with the values of the driver at which they occur."""
         assert output.speed_ratios is not None
         units, scale = self.count.units, max(abs(extreme.ratio) for extreme in output.speed_ratios)
         slides = output.kind == "slides"
@@ -140,7 +141,7 @@ def characteristics(mechanism: Mechanism, driver: Drive = None) -> Characteristi
         driver: a driver or coordinate, as for `kinematics`; by default the only driver.
 
     Returns:
-        `Characteristics`, which print as a table.
+        A `Characteristics`, which prints as a table.
 
     Raises:
         SceneError: there is no such driver, or positions do not follow from it.
@@ -167,8 +168,9 @@ def characteristics(mechanism: Mechanism, driver: Drive = None) -> Characteristi
 
 
 def _outputs(mechanism: Mechanism, driven: Coordinate) -> dict[str, tuple[str, Measured]]:
-    """Return the angle or the displacement of each link or pin that a joint connects to the ground, apart from the driven one.
+    """Return the angle or the displacement of each link or pin that a joint connects to the ground, except the driven one.
 
+    By the name of the link or pin, the result has the kind of its motion, "swings" or "slides", and the measured quantity.
     A pin in a slot of the ground has its own name, unless its link is a slider that turns on it.
     """
     found: dict[str, tuple[str, Measured]] = {}
@@ -207,7 +209,10 @@ def _output(cycle: Cycle, kind: str, weights: Measured, turning: list[TurningPoi
 
 
 def _speed_ratios(cycle: Cycle, weights: Measured, extremes: list[tuple[float, float]]) -> tuple[SpeedRatio, SpeedRatio]:
-    """Return the least and the largest of the extremes; if there are none, the constant ratio twice."""
+    """Return the least and the largest ratio of the `extremes`, pairs of the driver's value and the ratio there.
+
+    If there are none, the constant ratio is returned twice.
+    """
     if not extremes:
         constant = SpeedRatio(float(cycle.rates(weights)[0]), ())
         return constant, constant
@@ -221,7 +226,7 @@ def _speed_ratios(cycle: Cycle, weights: Measured, extremes: list[tuple[float, f
 
 
 def _transmission_angles(mechanism: Mechanism, driven: Coordinate, cycle: Cycle) -> dict[str, tuple[float, float]]:
-    """Return the limits of the acute angle between two moving links of two pins each, at pins off the driven links."""
+    """Return by pin the least and the largest acute angle between two moving links of two pins each, except at driven links."""
     found = {}
     for pin, links in transmission_pins(mechanism, driven.bodies).items():
         weights, directions = np.zeros((len(mechanism.bodies), 3)), []
@@ -243,7 +248,7 @@ def acute_range(low: float, high: float) -> tuple[float, float]:
 
 
 def _pressure_angles(mechanism: Mechanism, driver: str | Coordinate, cycle: Cycle) -> dict[str, tuple[float, float]]:
-    """Return the limits of the pressure angle of each cam with a moving follower: the grid's, refined around them."""
+    """Return the least and the largest pressure angle of each cam with a moving follower, on a grid that is refined there."""
     found = {}
     for name, joint in mechanism.joints.items():
         if not isinstance(joint, Cam) or joint.bodies[1] == GROUND:
@@ -264,7 +269,7 @@ def _pressure_angles(mechanism: Mechanism, driver: str | Coordinate, cycle: Cycl
 
 
 def _ratios(mechanism: Mechanism, cycle: Cycle, driven: Coordinate) -> dict[str, float]:
-    """Return the constant angular velocities of links for one of the driver; links whose ratio varies have none."""
+    """Return the angular velocities of links per unit angular velocity of the driver, without links whose ratio varies."""
     if driven.coordinate != "angle":
         return {}
     rates = cycle.dq[:, :, 2]

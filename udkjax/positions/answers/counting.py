@@ -19,13 +19,13 @@ DRAWN = 1e-10  # relative to the largest: smaller is rounding of a drawing's num
 
 
 class Count(NamedTuple):
-    """The count of a driver's values: the shown number is (value + offset) / size.
+    """The scale on which a driver's values are shown and read: the shown number is (value + offset) / size.
 
     Attributes:
-        offset: added to the driver's value (rad, m).
-        size: the shown unit in rad or m.
-        unit: the shown unit.
-        words: the counted quantity and its zero.
+        offset: the angle or length (rad, m) that is added to the driver's value.
+        size: the shown unit in rad, m or s.
+        unit: the name of the shown unit.
+        words: a phrase with the counted quantity and its zero, such as "the angle of A-B from the x axis".
         units: the units of the drawing, for texts and plain numbers.
     """
 
@@ -37,7 +37,7 @@ class Count(NamedTuple):
 
     @classmethod
     def of(cls, mechanism: Mechanism, driver: str | Coordinate) -> "Count":
-        """Return the count of the values of a driver or coordinate; numbers of the mechanism are concrete.
+        """Return the `Count` of a driver or coordinate; numbers of the mechanism are concrete.
 
         The angle of a drawn link on the ground is that of the line from its pin on the ground to its first other pin; the angles
         of other links are those of their bodies. Lengths are in the unit of the drawing, coordinates of slides from the drawn
@@ -58,7 +58,7 @@ class Count(NamedTuple):
 
     @classmethod
     def of_run(cls, mechanism: Mechanism, unit: str) -> "Count":
-        """Return the count of the times of a run (s), or of the values of an unknown driver (rad, m) over which it moves."""
+        """Return the `Count` of the times of a run, if `unit` is "s", or of the values of an unknown driver, in "rad" or "m"."""
         units = Units.of(mechanism.drawing)
         if unit == "rad":
             return cls(0.0, math.pi / 180, "deg", "the angle of the driver", units)
@@ -75,24 +75,24 @@ class Count(NamedTuple):
         return "rad/s" if self.is_angle else "m/s"
 
     def shown(self, value: float) -> float:
-        """Return a driver's value (rad, m) as it is counted, in the shown unit."""
+        """Return the shown number for a driver's value (rad, m)."""
         return (float(value) + self.offset) / self.size
 
     def text(self, value: float) -> str:
-        """Return a driver's value (rad, m) as text, as it is counted."""
+        """Return the shown number for a driver's value (rad, m), as text with its unit."""
         return f"{self.number(value)} {self.unit}"
 
     def number(self, value: float) -> str:
-        """Return a driver's value (rad, m) as text without its unit, as it is counted."""
+        """Return the shown number for a driver's value (rad, m), as text without its unit."""
         return format_number(self.shown(value), scale=360.0 if self.is_angle else 0.0)
 
     def within_turn(self, value: float) -> str:
-        """Return a driver's value (rad, m) as text; an angle from 0 to 360 degrees."""
+        """Return a driver's value (rad, m) as `text` does, but an angle from 0 to 360 degrees."""
         whole = math.floor((value + self.offset) / FULL_TURN + ROUNDING) if self.is_angle else 0
         return self.text(value - FULL_TURN * whole)
 
     def read(self, given: object, name: str) -> float:
-        """Return the driver's value (rad, m) of a counted number, in the unit of the drawing, or text with its unit.
+        """Return the driver's value (rad, m) for a shown number: a number in the unit of the drawing, or a text with its unit.
 
         Raises:
             SceneError: it is not a number, or the unit does not fit; the message begins with `name`.
@@ -104,13 +104,13 @@ class Count(NamedTuple):
         return self._number(given, self.rate_unit + (str(order) if order > 1 else ""), name)
 
     def rate_text(self, rate: float) -> str:
-        """Return a rate of the driver (rad/s, m/s) as text."""
+        """Return a rate of the driver (rad/s, m/s) as a phrase, such as "at 62.8319 rad/s (600 rpm)"."""
         if self.is_angle:
             return f"at {format_number(rate, 'rad/s')} ({format_number(rate * 30 / np.pi, 'rpm')})"
         return f"at {format_number(rate / self.size, self.unit)}/s"
 
     def nearest(self, value: float, start: float) -> float:
-        """Return the driver's value (rad, m); an angle by whole turns as near to `start` as possible."""
+        """Return a driver's value (rad, m), in the case of an angle shifted by whole turns to be nearest to `start`."""
         return value - FULL_TURN * round((value - start) / FULL_TURN) if self.is_angle else value
 
     def _number(self, given: object, unit: str, name: str) -> float:
@@ -140,7 +140,7 @@ def _link_line(drawing: Drawing, link: str) -> tuple[str, str, float]:
 
 
 def _words_of_length(mechanism: Mechanism, driver: str | Coordinate, element: Coordinate) -> str:
-    """Return in words which length a driver or coordinate is, and its zero."""
+    """Return a phrase with the length that a driver or coordinate prescribes and its zero, such as "the distance A-B"."""
     first, second = element.bodies
     motors = mechanism.drawing.groups["motor"] if isinstance(mechanism.drawing, Drawing) else {}
     motor = motors.get(driver) if isinstance(driver, str) else None

@@ -44,7 +44,7 @@ class FourBarType(NamedTuple):
 
 
 def four_bars(mechanism: Mechanism, driver: Coordinate | None = None) -> list[FourBarType]:
-    """Return the four-bar loops on the ground, from their input: the link that the driver turns, or else the first.
+    """Return the four-bar loops on the ground, each beginning with its input: the link that the driver turns, or else the first.
 
     Grashof's condition s + l < p + q on the shortest, the longest and the other lengths lets the shortest link turn all the way
     round relative to the others. With the input as the shortest link: crank-rocker; the ground: double crank; the coupler: double
@@ -60,7 +60,7 @@ Pins = dict[str, dict[str, np.ndarray]]  # the bodies at each pin, with its plac
 
 
 def pins_with_bodies(mechanism: Mechanism) -> Pins:
-    """Return the pins of revolutes: those at the same point of a body are one pin of all bodies.
+    """Return the pins of revolute joints; joints at the same point of a body are one pin of all of their bodies.
 
     Args:
         mechanism: the mechanism.
@@ -104,7 +104,7 @@ def transmission_pins(
 
 
 def _loops(mechanism: Mechanism, pins: Pins) -> Iterator[Loop]:
-    """Iterate over the closed chains of the ground and three links by four different pins; each in one direction."""
+    """Yield the closed chains of the ground and three links, connected by four different pins, each in one direction."""
 
     def onward(body: str) -> Iterator[tuple[str, str]]:
         yield from ((pin, other) for pin, at in pins.items() if body in at for other in at if other != body)
@@ -138,9 +138,9 @@ class Mobility(NamedTuple):
     """Degrees of freedom without drivers.
 
     Attributes:
-        counted: by Gruebler: three for each moving link, minus the rows of all joints.
-        true: three for each moving link, minus the rank of these rows in a generic position.
-        links: the number of links with the ground.
+        counted: Gruebler's count: three for each moving link, minus the number of rows of all joints.
+        true: three for each moving link, minus the rank of these rows in a generic position; None if the rank is not known.
+        links: the number of links, including the ground.
         joints: the number of joints.
     """
 
@@ -160,7 +160,7 @@ class Mobility(NamedTuple):
 
 
 def mobility(mechanism: Mechanism) -> Mobility:
-    """Return the degrees of freedom without drivers, as counted by Gruebler and as they are."""
+    """Return the degrees of freedom without drivers, by Gruebler's count and by the rank of the constraints."""
     bare = analyse(without_drivers(mechanism))
     rows, bodies = len(bare.row_names), len(mechanism.bodies)
     return Mobility(3 * bodies - rows, bare.degrees_of_freedom, bodies + 1, len(mechanism.joints))

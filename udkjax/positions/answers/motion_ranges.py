@@ -81,12 +81,12 @@ def motion_ranges(mechanism: Mechanism, motion: Annotated[StateHistory, HISTORY]
 
 
 def _ends(x: Float[Array, "T *k"]) -> Float[Array, "2 *k"]:
-    """Return the least and the largest value, ignoring NaN."""
+    """Return the least and the largest value over the first axis, ignoring NaN."""
     return jnp.stack([jnp.nanmin(x, 0), jnp.nanmax(x, 0)])
 
 
 def range_lines(found: MotionRanges) -> dict[str, str]:
-    """Return ranges as texts by body or joint."""
+    """Return the ranges as texts, by body or joint; ranges without a position are left out."""
     swings, strokes, angles = (
         {name: np.asarray(x) for name, x in ranges.items() if np.all(np.isfinite(x))}
         for ranges in (found.swings, found.strokes, found.transmission_angles)

@@ -54,7 +54,9 @@ class PinMotion(PrintsTable):
         return PrintedTable(pins.title, [*pins.rows, *below], pins.heads)
 
     def tables(self) -> list[PrintedTable]:
-        """Return the tables of pins and of links, in the units of the drawing, at one value or by the driver's values.
+        """Return the table of pins and that of links, in the units of the drawing.
+
+        If there are several values of the driver, each has a row for each pin or link.
 
         Raises:
             ValueError: `count` is None.
@@ -84,7 +86,7 @@ class PinMotion(PrintsTable):
     def _usual(self, is_angle: bool) -> tuple[list[float], float]:
         """Return usual sizes of places, velocities and accelerations of pins (shown units), and of angular velocities (rad/s).
 
-        They follow from the size of the mechanism and the rate of its driver; smaller numbers by rounding are zero.
+        They follow from the size of the mechanism and the rate of its driver. Numbers that are far smaller are rounding errors.
         """
         assert self.count is not None
         places = [np.asarray(motion)[:, 0] for motion in self.pins.values()]
@@ -94,11 +96,11 @@ class PinMotion(PrintsTable):
         return [size, size * turning, size * turning**2], turning
 
     def counted(self, count: Count) -> "PinMotion":
-        """Return the same motion with the driver's values shown by this count."""
+        """Return the same motion with another `Count`, by which the driver's values are shown."""
         return dataclasses.replace(self, count=count)
 
     def title(self) -> str:
-        """Return as text where the driver is, from which zero it counts, and how fast it moves."""
+        """Return a title with the driver's value, or its first and last, the counted quantity and its zero, and its rate."""
         count = self.count
         assert count is not None
         ends = [count.text(float(x)) for x in (self.values[0], self.values[-1])]
@@ -115,7 +117,7 @@ class PinMotion(PrintsTable):
             title: the title of the table.
             heads: its heads.
             rows: its numbers by name.
-            usual: a usual size of each column; zero where that of its numbers is one.
+            usual: the least size that is assumed for the numbers of each column, to recognize rounding errors.
         """
         many = len(self.values) > 1
         sizes = np.abs(np.array([row for motion in rows.values() for row in motion]).reshape(-1, len(heads) - 1))
@@ -133,14 +135,20 @@ class PinMotion(PrintsTable):
 
 
 def _pin_row(motion: Float[np.ndarray, "3 2"], least: Sequence[float]) -> list[float]:
-    """Return x and y of a pin, and size and direction (deg) of its velocity and acceleration; less than `least` is rounding."""
+    """Return x and y of a pin, and size and direction (deg) of its velocity and acceleration.
+
+    Components of the position, velocity and acceleration below the three numbers of `least` are rounding errors, shown as zero.
+    """
     place, *vectors = np.where(np.abs(motion) > np.reshape(least, (3, 1)), motion, np.where(np.isnan(motion), np.nan, 0.0))
     sizes = [[float(np.hypot(*vector)), float(np.degrees(np.arctan2(vector[1], vector[0])))] for vector in vectors]
     return [*place.tolist(), *sizes[0], *sizes[1]]
 
 
 def _ratio(rate: np.ndarray, motion: np.ndarray) -> np.ndarray:
-    """Return the rates of a driver and a link (T, 3) as a ratio: infinite where the link stands still, NaN if it never turns."""
+    """Return the driver's rate over a link's angular velocity, (T,): infinite where the link stands still, NaN if it never turns.
+
+    `motion` has the link's angle, angular velocity and angular acceleration, (T, 3).
+    """
     omega, alpha = motion[:, 1], motion[:, 2]
     still = np.abs(omega) <= DRAWN * np.abs(rate)
     never = np.all(still & (np.abs(alpha) <= DRAWN * rate**2))
@@ -186,7 +194,7 @@ def pin_motion(mechanism: Mechanism, motion: Annotated[Kinematics, HISTORY]) -> 
 
 
 def _point_motion(motion: Kinematics, body: str, local: Array) -> Float[Array, "T 3 2"]:
-    """Return position, velocity and acceleration of a point in the frame of a body."""
+    """Return position, velocity and acceleration, in ground axes, of the point `local` of a body, given in its frame (m)."""
     q, v, a, (px, py) = (by_numpy(x) for x in (motion.q, motion.v, motion.a, local))
     xp = library_for((q, v, a, px))
     k = motion.bodies.index(body)
@@ -240,5 +248,5 @@ def motion_at(
 
 
 def usual_rate(mechanism: Mechanism, driver: Drive) -> float:
-    """Return the constant speed of a driver (rad/s, m/s), or one unit per second."""
+    """Return the constant speed of a driver (rad/s, m/s); 1 if it has none, or for a coordinate without a driver."""
     return (constant_speed(mechanism, driver) if isinstance(driver, str) else 0.0) or 1.0

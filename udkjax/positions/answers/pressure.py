@@ -53,7 +53,7 @@ def pressure_angle(
 
 
 def pressure_angles(mechanism: Mechanism, q: Float[np.ndarray, "T bodies 3"], cam: str, driver: Drive) -> Float[np.ndarray, "T"]:
-    """Return the pressure angles (rad) of a cam at coordinates, as `pressure_angle`."""
+    """Return the pressure angles (rad) of a cam in the positions q, as `pressure_angle` does; all positions are finite."""
     cams = [name for name, joint in mechanism.joints.items() if isinstance(joint, Cam)]
     if cam not in cams:
         raise SceneError([f"{quote(cam)} is not a cam; there are {', '.join(map(quote, cams)) or 'none'}"], mechanism.name)
@@ -82,7 +82,7 @@ def pressure_angles(mechanism: Mechanism, q: Float[np.ndarray, "T bodies 3"], ca
 
 
 def _slopes(mechanism: Mechanism, driver: Drive, q: Float[np.ndarray, "T bodies 3"]) -> Float[np.ndarray, "T k n"]:
-    """Return the slopes of the driver by q if it is a coordinate without a motion, which no constraint holds; else none."""
+    """Return the gradient by q of a coordinate without a driver, with k = 1 row; for a driver, which has a row of Psi, k = 0."""
     driver = only_driver(mechanism) if driver is None else driver
     if isinstance(driver, str) and driver in mechanism.drivers:
         return np.zeros((len(q), 0, q[0].size))

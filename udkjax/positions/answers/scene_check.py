@@ -19,7 +19,7 @@ from udkjax.wording import numbered
 
 @prints_table
 class Check(NamedTuple):
-    """Findings of `check` on a mechanism's constraints."""
+    """The findings of `check` about a mechanism: its constraints, the closure of its initial guess, and likely mistakes."""
 
     bodies: int
     coordinates: int
@@ -62,10 +62,10 @@ class Check(NamedTuple):
 @checked
 @concrete_only()
 def check(mechanism: Mechanism) -> Check:
-    """Count rows, rank and degrees of freedom, name redundant rows, and measure how well the initial guess closes.
+    """Return rows, rank and degrees of freedom of a mechanism, its redundant rows, and the residuals of its initial guess.
 
-    Names bodies that assembly moves by more than a hundredth of their size, and likely mistakes: points far outside all bodies,
-    angles that look like degrees, bodies without a joint.
+    The result also names bodies that assembly moves by more than a hundredth of their size, and likely mistakes: points far
+    outside all bodies, angles that look like degrees, bodies without a joint.
 
     Args:
         mechanism: a mechanism of concrete numbers.

@@ -1,4 +1,4 @@
-"""Places over the values of a driver where an angle or a displacement turns back, to rounding."""
+"""Values of a driver at which an angle or a displacement turns back or is fastest, accurate to rounding."""
 
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple, TypeVar
@@ -24,7 +24,7 @@ Item = TypeVar("Item")
 
 
 class Combination(NamedTuple):
-    """A combination of the coordinates of bodies, such as the angle of a body, or its displacement along a line.
+    """A linear combination of the coordinates of bodies, such as the angle of a body, or its displacement along a line.
 
     Attributes:
         weights: of the coordinates x, y (m) and angle (rad) of each body, (bodies, 3).
@@ -37,11 +37,11 @@ class Combination(NamedTuple):
         return np.einsum("tbc,bc->t", coordinates, self.weights)
 
     def height(self, q: Float[np.ndarray, "T bodies 3"]) -> Float[np.ndarray, "T"]:
-        """Return the combination of coordinates."""
+        """Return the values (T,) of the combination at coordinates."""
         return self.of(q)
 
     def curves(self, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the combination (T,) at coordinates, and its first and second derivatives, from theirs."""
+        """Return the combination (T,) at coordinates q, and its two derivatives, from the derivatives dq and ddq of q."""
         return self.of(q), self.of(dq), self.of(ddq)
 
 
@@ -59,11 +59,11 @@ class PointAlong(NamedTuple):
     axis: float
 
     def height(self, q: Float[np.ndarray, "T bodies 3"]) -> Float[np.ndarray, "T"]:
-        """Return the displacement at coordinates."""
+        """Return the displacements (T,) at coordinates (m)."""
         return self.curves(q, q, q)[0]
 
     def curves(self, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the displacement (T,) at coordinates, and its first and second derivatives, from theirs."""
+        """Return the displacement (T,) at coordinates q, and its two derivatives, from the derivatives dq and ddq of q."""
         along = np.array([np.cos(self.axis), np.sin(self.axis)])
         (place, speed, change), angle = (x[:, self.body, :2] for x in (q, dq, ddq)), q[:, self.body, 2]
         omega, alpha = dq[:, self.body, 2], ddq[:, self.body, 2]
@@ -77,7 +77,13 @@ Measured = Combination | PointAlong
 
 
 class TurningPoint(NamedTuple):
-    """A value (rad, m) of the driver, the combination there, and whether it stands still around the value."""
+    """A point at which a measured quantity turns back.
+
+    Attributes:
+        value: the value of the driver (rad, m).
+        height: the measured quantity at this value.
+        dwells: whether the quantity stands still around the value.
+    """
 
     value: float
     height: float
@@ -85,7 +91,7 @@ class TurningPoint(NamedTuple):
 
 
 class Cycle:
-    """The positions of a mechanism over the whole range of its driver, and its derivatives by the driver's value.
+    """The positions of a mechanism over the whole range of its driver, and their derivatives by the driver's value.
 
     Args:
         mechanism: a mechanism with concrete numbers.
@@ -93,9 +99,10 @@ class Cycle:
 
     Attributes:
         turns: whether the range is a whole turn, without limits.
+        is_known: whether the range is a whole turn or has a toggle at both ends; otherwise the arrays below are empty.
         values: the values (T,) in rad or m.
         q, dq, ddq: the coordinates (T, bodies, 3) and their derivatives.
-        ends: values of the driver, and coordinates, at its toggles.
+        ends: the value of the driver and the coordinates (bodies, 3) at each of its toggles.
     """
 
     def __init__(self, mechanism: Mechanism, driver: str | Coordinate):
@@ -114,7 +121,7 @@ class Cycle:
         self.values, self.q, self.dq, self.ddq = self._parts(self.at(values)) if self.is_known else (np.zeros(0),) * 4
 
     def at(self, values: np.ndarray) -> Kinematics:
-        """Return the kinematics at increasing values, at a rate of one."""
+        """Return the kinematics at increasing values of the driver, with a rate of one."""
         return kinematics(*self._given, values)
 
     @staticmethod
@@ -123,7 +130,7 @@ class Cycle:
         return tuple(np.asarray(x)[good] for x in (motion.values, motion.q, motion.v, motion.a))
 
     def turning_points(self, measured: Sequence[Measured]) -> list[list[TurningPoint]]:
-        """Return the places where each combination turns back, in the order of the driver's values."""
+        """Return the turning points of each measured quantity, in the order of the driver's values."""
         found = [(k, i) for k, one in enumerate(measured) for i in _sign_changes(self._curves(one)[1])]
         if not found:
             return [[] for _ in measured]
@@ -149,10 +156,10 @@ class Cycle:
         return _by_number(zip(which, points, strict=True), len(measured))
 
     def speed_extremes(self, measured: Sequence[Measured]) -> list[list[tuple[float, float]]]:
-        """Return the values of the driver, in order, at which the rate of each combination by it is extreme, with these rates.
+        """Return for each measured quantity the values of the driver at which its first derivative is extreme, with the latter.
 
-        At these the second derivative is zero; it is found by the secants of Illinois, which also find places where it jumps. A
-        combination that moves in proportion to the driver has none.
+        There the second derivative is zero, or jumps through zero. The values are found by the Illinois method (regula falsi),
+        and are in increasing order. A quantity that moves in proportion to the driver has none.
         """
         curves = [self._curves(one)[2] for one in measured]
         sizes = [np.max(np.abs(self._curves(one)[1]), initial=0.0) for one in measured]
@@ -179,14 +186,17 @@ class Cycle:
         return _by_number(((k, (v, r)) for k, v, r in pairs), len(measured))
 
     def rates(self, one: Measured) -> np.ndarray:
-        """Return the first derivative of a measured quantity by the driver's value, at `values`."""
+        """Return the first derivative of a measured quantity by the driver's value, at all `values` of the cycle."""
         return self._curves(one)[1]
 
     def _curves(self, one: Measured) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         return one.curves(self.q, self.dq, self.ddq)
 
     def heights(self, one: Measured, turning: Sequence[TurningPoint]) -> np.ndarray:
-        """Return the values of a combination among which are its least and its largest."""
+        """Return values of a measured quantity that include its least and its largest value over the range.
+
+        `turning` has the quantity's turning points.
+        """
         at_ends = [one.height(q[None])[0] for _, q in self.ends]
         inner = [] if turning else one.height(self.q[[0, -1]]).tolist()
         return np.array([point.height for point in turning] + at_ends + inner)
@@ -200,7 +210,11 @@ def _by_number(pairs: Iterable[tuple[int, Item]], count: int) -> list[list[Item]
 
 
 def _sign_changes(slopes: np.ndarray, size: float = 0.0) -> list[int]:
-    """Return the indices before changes of sign. Errors of rounding, of slopes or of another size, have none; a dwell has one."""
+    """Return each index k for which the sign of slope k + 1 differs from that of slope k.
+
+    Slopes that are rounding errors, relative to the largest slope or to `size`, have the sign of the slope before: a dwell has at
+    most one change.
+    """
     signs = np.sign(slopes)
     signs[np.abs(slopes) <= STILL * max(size, np.max(np.abs(slopes), initial=0.0))] = 0.0
     last = np.maximum.accumulate(np.where(signs != 0.0, np.arange(len(signs)), 0))

@@ -163,7 +163,7 @@ def assemble(
 def _assemble_given(
     mechanism: Mechanism | ConstrainedSystem, t: NumberLike, state: State | None, throw: bool, given: GivenState
 ) -> State:
-    """Close the position with the given coordinates, then the velocity with the given ones."""
+    """Return the state that `assemble` returns with given values: its position is closed first, then its velocity."""
     if state is None and mechanism.q0 is not None and mechanism.v0 is not None:
         state = State(mechanism.q0, mechanism.v0)
     try:
@@ -175,7 +175,7 @@ def _assemble_given(
 
 
 def _close_system(system: ConstrainedSystem, t: NumberLike, state: State | None = None) -> Closure:
-    """Close a user-defined system as `close` does, from a state or its own guess, without derivatives of the rank.
+    """Close a user-defined system as `close` does, from a given state or the guess q0, v0 of the system.
 
     Raises:
         ValueError: there is neither a state nor a guess.
@@ -197,7 +197,7 @@ def close(
     state: State | None = None,
     analysis: Analysis | None = None,
 ) -> Closure:
-    """Close a mechanism as `assemble` does, and return the residuals with the state instead of raising.
+    """Return the state to which `assemble` closes a mechanism, with its residuals; no error is raised if it stays open.
 
     The closure of concrete numbers of a mechanism is concrete, even while something else is traced.
     """
@@ -217,7 +217,7 @@ def close(
 
 
 def _with_closed_positions(mechanism: Mechanism, t: NumberLike, state: State | None) -> State | None:
-    """Return a state in which all joints but rolling ones are closed: these restrict no positions."""
+    """Return the guess with its positions closed for all joints except rolling ones; `state` if there are no rolling joints."""
     if not (names := rolling_joints(mechanism)):
         return state
     positions = close(mechanism.without_joints(names), t, state).state.q
@@ -241,7 +241,7 @@ def _closure_of_concrete(mechanism: Mechanism, t: float, state: State | None, an
 
 
 def _close_concrete(mechanism: Mechanism, scales: Scales, t: float, q: np.ndarray, v: np.ndarray) -> tuple:
-    """Return q and v closed, the residuals Psi and Psi_dot, and the rank of D, by NumPy."""
+    """Return q and v of the closed state near a guess, the residuals Psi and Psi_dot, and the rank of D, of concrete numbers."""
     if scene_programs(mechanism).is_small:  # compiling anything takes longer
         return DenseRows(mechanism, scales).assemble(t, q, v)
     if native_closing.can_close(mechanism):
@@ -295,7 +295,7 @@ class AssemblyWarning(UserWarning):
 
 
 def moves_of_assembly(mechanism: Mechanism, q: Float[Array, "bodies 3"]) -> tuple[str, ...]:
-    """Describe how far assembly moved each body from its initial guess, where it is more than `WORTH_SAYING`."""
+    """Return a sentence for each body that assembly, with the result q, has moved by more than `WORTH_SAYING` of its size."""
     change = np.asarray(q) - np.asarray(mechanism.q0)
     distance, angle = np.hypot(change[:, 0], change[:, 1]), np.abs(change[:, 2])
     if not np.any(change):
@@ -313,7 +313,11 @@ def _moves(mechanism: Mechanism, distances: np.ndarray, angles: np.ndarray) -> I
 
 
 def moves_from_guess(mechanism: Mechanism, t: Array | np.ndarray, closure: Any) -> str:
-    """Return a warning if assembly at time t (s) moved a body far, else an empty string; numbers are concrete."""
+    """Return a warning if assembly at time t (s) moved a body far from its initial guess, else "".
+
+    The result is also "" if t is traced, if the closure is not closed, and if drivers may have moved the bodies before t. Other
+    numbers are concrete.
+    """
     if isinstance(t, Tracer) or (t and mechanism.drivers) or not closure.is_closed:
         return ""  # later the drivers decide where the bodies are
     moves = moves_of_assembly(mechanism, closure.state.q)
@@ -322,7 +326,7 @@ def moves_from_guess(mechanism: Mechanism, t: Array | np.ndarray, closure: Any) 
 
 
 def poses_table(title: str, names: Sequence[str], q: ArrayLike, v: ArrayLike | None = None) -> PrintedTable:
-    """Return a table of coordinates and, if given, velocities (bodies, 3); bodies without names are numbered."""
+    """Return a table of coordinates q and, if given, velocities v (bodies, 3); if `names` is empty, bodies are numbered."""
     arrays = [np.asarray(x, float) for x in ((q,) if v is None else (q, v))]
     heads = ["body", "x (m)", "y (m)", "angle (rad)", "vx (m/s)", "vy (m/s)", "omega (rad/s)"][: 1 + 3 * len(arrays)]
     scales = [scale for x in arrays for scale in (size_of(x), size_of(x), float(np.nanmax(np.abs(x[..., 2]), initial=0.0)))]

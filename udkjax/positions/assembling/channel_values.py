@@ -35,7 +35,7 @@ from udkjax.scene.mechanism import Mechanism
 def measure(
     mechanism: Mechanism | ConstrainedSystem, solution: StateHistory, channels: Sequence[Channel | Quantity]
 ) -> Float[Array, "T C"]:
-    """Compute the values of channels at the output times of a solution, which may be traced and batched.
+    """Return the values of channels at the output times of a solution, which may be traced and batched.
 
     Accelerations and reactions are those of the constraints without stabilization,
 
@@ -111,8 +111,8 @@ def _fill(
 ) -> tuple["_Motion", Bool[Array, "T"], Bool[Array, "T"]]:
     """Return a motion whose NaN states are replaced, to keep all derivatives finite, and two masks.
 
-    They are replaced by the scene's guess; without bodies by the first state, or by ones. The masks are of the times at which
-    positions are finite, and of those at which velocities are finite too.
+    The scene's guess replaces NaN states; in a model without bodies the first state does, or ones. The first mask is True at
+    times at which positions are finite, the second at times at which velocities are finite as well.
     """
     axes = tuple(range(1, jnp.ndim(solution.q)))
     placed = jnp.all(jnp.isfinite(solution.q), axis=axes)
@@ -203,7 +203,11 @@ class _Motion:
         return Point(ax - alpha * arm.y - square * arm.x, ay + alpha * arm.x - square * arm.y)
 
     def load(self, owner: str, body: str) -> tuple[Array, Array, Array]:
-        """Return force and torque of a constraint on a body; for the ground, minus the sum over the other bodies."""
+        """Return force x, force y (N) and torque (N m) of a constraint on a body, each (T,).
+
+        Torques are about the centre of mass. The load on the ground is minus the sum over the bodies, with the torque about the
+        origin.
+        """
         loads = self.loads[owner]
         if body != GROUND:
             fx, fy, torque = self._entries(loads, body)
@@ -228,7 +232,7 @@ def _measure_body(channel: Channel, motion: _Motion) -> Array:
 
 
 def _component(motion: _Motion, body: str, point: Float[Array, "2"] | tuple[float, float], quantity: str) -> Array:
-    """Return x or y of the position, velocity (vx, vy) or acceleration (ax, ay) of a point."""
+    """Return x or y of the position, velocity or acceleration of a point of a body; `quantity` is x, y, vx, vy, ax or ay."""
     values = motion.point(body, point, DERIVATIVE[quantity[:-1]])
     return jnp.broadcast_to(getattr(values, quantity[-1]), motion.ts.shape)
 

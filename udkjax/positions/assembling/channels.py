@@ -55,7 +55,13 @@ class StateHistory(Protocol):
 
 @dataclass(frozen=True)
 class Channel:
-    """A measured quantity: plain data, equal if canonical names are equal, and thus static in compiled programs."""
+    """A measurable quantity of a motion: plain data, equal if canonical names are equal, and thus static in JAX programs.
+
+    Attributes:
+        name: the canonical name, such as "body.link1.angle".
+        units: the SI unit, as text.
+        needs: the part of a motion's computation that the channel needs; accelerations and reactions take more time.
+    """
 
     name: str
     units: str
@@ -68,7 +74,7 @@ class Channel:
 
     @property
     def is_of_point(self) -> bool:
-        """True if it is a component of the motion of a point."""
+        """True if the channel is x or y of the position, velocity or acceleration of a point."""
         return self.quantity in POINT_UNITS
 
 
@@ -103,12 +109,12 @@ class Quantity:
 
 
 def has_point(joint: Joint) -> bool:
-    """Return True if a joint has a point: it then has a pin."""
+    """Return True if a joint has points on its bodies: its name is then also the name of a pin."""
     return getattr(joint, "points", None) is not None
 
 
 def pins_of(mechanism: Mechanism) -> list[str]:
-    """Return the names of all named points: joints, and pins of the drawing at which no two links meet."""
+    """Return the names of all named points: joints that have points, and pins of the drawing at which no two links meet."""
     drawn = () if mechanism.drawing is None else mechanism.drawing.groups["pin"]
     joints = [name for name, joint in mechanism.joints.items() if has_point(joint)]
     return [*joints, *(name for name in drawn if name not in mechanism.joints)]
@@ -130,7 +136,7 @@ def point_of_pin(mechanism: Mechanism, name: str) -> tuple[str, Float[Array, "2"
 
 
 def locate(mechanism: Mechanism, of: str, point: Numbers | None = None) -> tuple[str, Float[Array, "2"]]:
-    """Return a body, or "ground", and a point (m) in its frame, from the name of a joint, or from a body and a point.
+    """Return a body, or "ground", and a point (m) in its frame, from the name of a pin, or from a body and a point.
 
     Raises:
         ValueError: there is no such body or joint, or the joint has no point; the message suggests another name.
@@ -168,7 +174,7 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def channel_of(mechanism: Mechanism | ConstrainedSystem, text: str) -> Channel:
-    """Return the channel with a name; names of bodies and joints may contain dots.
+    """Return the channel that a name such as "body.link1.angle" denotes; names of bodies and joints may contain dots.
 
     Raises:
         ValueError: no such channel; the message suggests another name.
@@ -268,7 +274,7 @@ _PARSERS: dict[str, Callable[[Mechanism, str], Channel]] = {
 
 
 def _split_owner(kind: str, names: Sequence[str], text: str) -> tuple[str, str]:
-    """Split a string into the longest of these names that it begins with, and the rest."""
+    """Split a string into the longest of the `names` that it begins with, and the rest; raise `ValueError` if there is none."""
     fitting = [name for name in names if text.startswith(name) and text[len(name) :].startswith((".", "("))]
     if fitting or text in names:
         name = max(fitting, key=len, default=text)
@@ -281,7 +287,10 @@ def _split_owner(kind: str, names: Sequence[str], text: str) -> tuple[str, str]:
 
 
 def _split_point(text: str, default: LocalPoint | None = None) -> tuple[LocalPoint, str]:
-    """Split a string into the point that it begins with, and the rest."""
+    """Split a string into the point with which it begins, such as "(0.1, 0)", or else the default, and the rest.
+
+    Raises a `ValueError` if there is no point and no default, or the point is malformed.
+    """
     if not text.startswith("("):
         if default is None:
             raise ValueError("must be distance.BODY(px, py).BODY2(px, py): each body needs a point, in its own frame (m)")

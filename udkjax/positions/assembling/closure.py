@@ -28,7 +28,7 @@ NativeGuess = tuple[Mechanism, Scales, Array, Array, Array]  # mechanism, scales
 
 
 class MotionFrom(Motion):
-    """A motion law shifted in time by `start` (s): machine code has derivatives with respect to `start`, as to any number."""
+    """The motion law t -> motion(start + t); machine code has derivatives with respect to the number `start` (s), but not t."""
 
     motion: Motion
     start: Number
@@ -46,13 +46,13 @@ def from_moment(mechanism: Mechanism, t: Float[Array, ""]) -> Mechanism:
 
 
 class TracedRows(NamedTuple):
-    """The `Rows` of a mechanism with traced numbers, by its equations of motion."""
+    """The constraints of a mechanism with traced numbers, in the interface `Rows` with which `close_position` closes them."""
 
     equations: TextbookEquations
 
     @classmethod
     def of(cls, mechanism: Mechanism, analysis: Analysis) -> "TracedRows":
-        """Return the rows of a mechanism."""
+        """Return the constraints of a mechanism, with the scales of its analysis."""
         return cls(equations_of(mechanism, SVD(), analysis=analysis))
 
     @property
@@ -67,13 +67,13 @@ class TracedRows(NamedTuple):
         return -root * (plus @ psi)
 
     def project(self, t: Time, q: Array, v: Array) -> tuple[Array, Array]:
-        """Return v after a Newton step to the constraints, and the rank of D."""
+        """Return v after a Newton step towards Psi_dot = 0, and the rank of D."""
         plus, residual, root = self.equations.linearized_velocity(t, q, v)
         return v - root * (plus @ residual), plus.rank
 
 
 def close_by_jax(mechanism: Mechanism, analysis: Analysis, t: Float[Array, ""], q: Float[Array, "n"], v: Array) -> Closed:
-    """Return q and v closed, the residuals Psi and Psi_dot, and the rank of D."""
+    """Return q and v of the closed state near a guess, the residuals Psi and Psi_dot, and the rank of D."""
     rows, rank = TracedRows.of(mechanism, analysis), 0
     if mechanism.constraints:
         q = _close_position(rows, t, q)
@@ -85,7 +85,7 @@ def close_by_jax(mechanism: Mechanism, analysis: Analysis, t: Float[Array, ""], 
 def close_by_machine_code(
     mechanism: Mechanism, analysis: Analysis, t: Float[Array, ""], q: Float[Array, "n"], v: Array
 ) -> Closed:
-    """Return the results of `close_by_jax`, by machine code."""
+    """Return the same results as `close_by_jax`, computed by machine code."""
     guess, inputs = split_numbers((_with_fixed_loads(mechanism), analysis, t, q, v))
     return _close_by_code(AssemblyFunction(guess), inputs)
 
@@ -153,7 +153,10 @@ class AssemblyFunction(DifferentiableFunction):
         return list(native_closing.second_derivative(guess, _native_inputs(which), *changes))
 
     def _native(self, inputs: list[Array], has_tangent: Mask) -> tuple[NativeGuess, PyTree] | tuple[None, None]:
-        """Return the arguments of machine code and the inputs with tangents; None if machine code lacks these derivatives."""
+        """Return the arguments of machine code, and the guess with True for the inputs that have tangents.
+
+        Both are None if machine code has no derivatives with respect to one of these inputs.
+        """
         which = self.guess.marks(has_tangent)
         mechanism, analysis, t, q, v = self.guess(inputs)
         others = any(m is True for m in jax.tree.leaves((which[1], which[2])))
@@ -191,7 +194,7 @@ def _close_position(rows: TracedRows, t: Array, q: Array) -> Array:
 
 
 def _close_position_plain(rows: TracedRows, t: Array, q: Array) -> Array:
-    """Take the steps of `_close_position` in a loop of fixed length, for reverse mode.
+    """Return the position after the steps of `_close_position`, taken in a loop of fixed length, for reverse mode.
 
     Even steps that no longer lower the residual are taken: at a closed state they only project the tangent to the manifold.
     """

@@ -60,7 +60,7 @@ class Coordinate(PrintsLine):
         return cls(driver.bodies, driver.coordinate, driver.points, driver.axis)
 
     def driver(self, motion: Motion | None = None) -> Driver:
-        """Return the driver that prescribes this coordinate; by default at zero."""
+        """Return the driver that prescribes this coordinate by a motion law; by default it is held at zero."""
         return Driver(self.bodies, self.coordinate, constant_motion(0.0) if motion is None else motion, self.points, self.axis)
 
     def value(self, *frames: Frame) -> Float[Array, ""]:
@@ -95,12 +95,18 @@ def value_of(mechanism: Mechanism, coordinate: str | Coordinate) -> Callable[[Ar
 
 
 def element_of(mechanism: Mechanism, driver: str | Coordinate) -> Coordinate:
-    """Return a coordinate by the name of its driver, or by its name. Raises `SceneError`."""
+    """Return the `Coordinate` of a driver or of a channel's name; a `Coordinate` is returned as it is.
+
+    Raises a `SceneError` if there is no such driver or coordinate.
+    """
     return named_element(mechanism, driver)[1]
 
 
 def named_element(mechanism: Mechanism, driver: str | Coordinate) -> tuple[str, Coordinate]:
-    """Return the name of a driver and its coordinate; a new name for a coordinate without a driver. Raises `SceneError`."""
+    """Return the name of a driver and its coordinate; for a coordinate without a driver, an unused name and the coordinate.
+
+    Raises a `SceneError` if there is no such driver or coordinate.
+    """
     if isinstance(driver, str) and driver in mechanism.drivers:
         return driver, Coordinate.of(mechanism.drivers[driver])
     element = coordinate_of(mechanism, driver) if isinstance(driver, str) else driver
@@ -108,9 +114,9 @@ def named_element(mechanism: Mechanism, driver: str | Coordinate) -> tuple[str, 
 
 
 def coordinate_of(mechanism: Mechanism, text: str) -> Coordinate:
-    """Return the coordinate of a channel's name: `body.NAME.angle`, `body.NAME(px, py).x`, `joint.NAME.angle`, or a distance.
+    """Return the coordinate with the name of a channel: `body.NAME.angle`, `body.NAME(px, py).x`, `joint.NAME.angle`, a distance.
 
-    Raises `SceneError`.
+    Raises a `SceneError` if there is no such channel, or it cannot be driven.
     """
     try:
         channel = channel_of(mechanism, text)

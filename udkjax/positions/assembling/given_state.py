@@ -57,11 +57,14 @@ class GivenState:
         return ", ".join(f"{name} = {format_number(float(value))}" for name, value in self.values.items())
 
     def at_position(self) -> Any:
-        """Return the model whose position has the given coordinates; the model itself if there are none."""
+        """Return the model with constraints that give its position the given coordinates; the model itself if none are given."""
         return self._imposed(False)
 
     def at_velocity(self, t: NumberLike, q: Array) -> Any:
-        """Return the model whose velocity at time t (s) and position q has the given ones; the model itself if there are none."""
+        """Return the model with constraints that give it the given velocities at time t (s) in the position q.
+
+        If no velocities are given, the model itself is returned.
+        """
         return self._imposed(True, t, q)
 
     def _imposed(self, rates: bool, *at: Any) -> Any:
@@ -70,12 +73,12 @@ class GivenState:
 
 
 class _GivenEntries(NamedTuple):
-    """Given entries of q and v of a system, as further rows."""
+    """The conditions that entries of q and v of a `ConstrainedSystem` have given values, as additional rows of Psi and phi."""
 
     model: ConstrainedSystem
 
     def parse(self, name: str) -> tuple[bool, int]:
-        """Return whether a name is that of a velocity, and the index of the entry."""
+        """Return True for the name of a velocity (`v[0]`), False for a coordinate (`q[0]`), and the index of the entry."""
         try:
             channel = channel_of(self.model, name)
         except ValueError as problem:
@@ -83,7 +86,12 @@ class _GivenEntries(NamedTuple):
         return channel.owner == "v", int(channel.quantity)
 
     def impose(self, entries: Mapping[str, tuple[int, Array]], *at: Any) -> ConstrainedSystem:
-        """Return the system with further rows, that entries of q have given values, or, `at` a state, entries of v."""
+        """Return the system with additional rows, by which entries have given values.
+
+        Args:
+            entries: the index and the value of each entry, by name.
+            at: nothing, for entries of q; t and q, for entries of v.
+        """
         places, values = np.array([k for k, _ in entries.values()]), jnp.stack([value for _, value in entries.values()])
         name = "velocity_constraint" if at else "constraint"
         old = getattr(self.model, name)
@@ -98,12 +106,12 @@ class _GivenEntries(NamedTuple):
 
 
 class _GivenCoordinates(NamedTuple):
-    """Given coordinates and rates of a mechanism, as further drivers."""
+    """The conditions that coordinates and velocities of a mechanism have given values, as additional drivers."""
 
     model: Mechanism
 
     def parse(self, name: str) -> tuple[bool, Coordinate]:
-        """Return whether a name is that of a velocity, and the coordinate."""
+        """Return True for the name of a velocity and False for that of a coordinate, and the (differentiated) coordinate."""
         owner, _, last = name.strip().rpartition(".")
         try:
             coordinate = coordinate_of(self.model, f"{owner}.{_COORDINATE_OF.get(last, last)}")
@@ -114,7 +122,12 @@ class _GivenCoordinates(NamedTuple):
         return last in RATES, coordinate
 
     def impose(self, coordinates: Mapping[str, tuple[Coordinate, Array]], *at: Any) -> Mechanism:
-        """Return the mechanism with further drivers, of constant coordinates, or, `at` time t and position q, of given rates."""
+        """Return the mechanism with additional drivers, by which coordinates have given values or rates.
+
+        Args:
+            coordinates: the coordinate and its value or rate, by name.
+            at: nothing, if values are given; t and q, if rates at this time and position are given.
+        """
         motions = {
             name: (c, [value_of(self.model, c)(at[1]) - x * at[0], x] if at else [x]) for name, (c, x) in coordinates.items()
         }
@@ -129,7 +142,10 @@ class _GivenCoordinates(NamedTuple):
         return self._driven(motions, origin)
 
     def _driven(self, motions: _Motions, origin: Origin | None = None) -> Mechanism:
-        """Return the mechanism with further drivers, whose motions are polynomials of time."""
+        """Return the mechanism with additional drivers, whose motions are polynomials of time.
+
+        If numbers are traced, `origin` is the concrete mechanism from which redundant rows are determined.
+        """
         more = {f"given {name}": c.driver(Polynomial(jnp.stack(x))).complete() for name, (c, x) in motions.items()}
         return self.model.with_drivers({**self.model.drivers, **more}, origin)
 

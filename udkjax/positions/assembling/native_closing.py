@@ -24,7 +24,7 @@ Closed = tuple[Array, Array, Array, Array, Array]
 
 
 def can_close(mechanism: Mechanism) -> bool:
-    """Return True if machine code supports the mechanism."""
+    """Return True if machine code can close the mechanism: it supports all elements, and JAX uses float64."""
     return jax.config.jax_enable_x64 and not unsupported(_close(mechanism).code)
 
 
@@ -34,7 +34,7 @@ def close(mechanism: Mechanism, scales: Scales, t: ArrayLike, q: Any, v: Any) ->
 
 
 def close_concrete(mechanism: Mechanism, scales: Scales, t: ArrayLike, q: Any, v: Any) -> Closed:
-    """Close a mechanism of concrete numbers without tracing anything."""
+    """Return the results of `close` for a mechanism of concrete numbers, without tracing anything."""
     return _unpack(call_concrete(_close(mechanism), _inputs(mechanism, scales, t, q, v, np), 2), len(q))
 
 
@@ -45,13 +45,25 @@ def _unpack(found: Sequence[Any], n: int) -> Closed:
 
 
 def close_jvp(guess: Any, active: Any, change: Any) -> tuple[Array, Array]:
-    """Return the changes of q and v along a `change` of the active leaves of (mechanism, scales, t, q, v)."""
+    """Return the directional derivatives of q and v of the closed state.
+
+    Args:
+        guess: mechanism, scales, t, q and v from which the state is closed.
+        active: the tree (mechanism, q, v) with True for the numbers that change.
+        change: the same tree with the changes of these numbers.
+    """
     operation = _close(guess[0]).with_tangents(ActiveNumbers(guess[0], active[0]).mask)
     return _close_along(guess, operation, (active, change))
 
 
 def second_derivative(guess: Any, active: Any, *changes: tuple[Any, Any]) -> tuple[Array, Array]:
-    """Return the second derivatives of q and v along two changes, each with its active leaves."""
+    """Return the second derivatives of q and v of the closed state along two changes.
+
+    Args:
+        guess: mechanism, scales, t, q and v from which the state is closed.
+        active: the tree (mechanism, q, v) with True for the numbers that change in at least one of both.
+        changes: the trees `active` and `change`, as for `close_jvp`, of each change.
+    """
     operation = _close(guess[0]).with_second_tangents(ActiveNumbers(guess[0], active[0]).mask)
     return _close_along(guess, operation, *changes)
 
@@ -66,7 +78,10 @@ def _close_along(guess: Any, operation: Close, *changes: tuple[Any, Any]) -> tup
 
 
 def close_vjp(guess: Any, active: Any, qbar: Array, vbar: Array) -> Any:
-    """Return the cotangents of the active leaves from those of q and v."""
+    """Return the cotangents of the active numbers, as a tree (mechanism, q, v), from those of q and v of the closed state.
+
+    `guess` and `active` are those of `close_jvp`.
+    """
     mechanism = guess[0]
     which = ActiveNumbers(mechanism, active[0])
     operation = _close(mechanism).with_cotangents(which.mask)

@@ -12,7 +12,10 @@ from udkjax.wording import MOST_LISTED
 
 
 def name_open_rows(names: Sequence[str], residual: np.ndarray, scales: np.ndarray, tol: float) -> str:
-    """Name the constraints whose residuals exceed `tol` times their scales, the largest first, with the residual."""
+    """Return a list, as text, of the constraints whose residuals exceed `tol` times their scales, with these, the largest first.
+
+    `names` has the constraint of each row.
+    """
     worst: dict[str, tuple[float, float]] = {}  # residual over the row's scale, and residual
     for name, size, unit in zip(names, np.abs(residual), scales, strict=True):
         if not size / unit <= tol:  # also NaN
@@ -38,7 +41,7 @@ def explain_open(
     psi_dot: np.ndarray,
     scales: np.ndarray,
 ) -> str:
-    """Explain why an assembly at time t (s) failed: the open joints, and whether drivers, joints or the guess are the cause.
+    """Return a message with the joints that an assembly at time t (s) has left open, and the cause: drivers, joints or the guess.
 
     Args:
         mechanism: the mechanism.

@@ -19,7 +19,7 @@ from udkjax.transforms.gradients import stop_gradients
 
 
 class SystemRows(NamedTuple):
-    """The `Rows` of a user-defined system."""
+    """The constraints of a user-defined system, in the interface `Rows` with which `close_position` closes them."""
 
     equations: Any
 
@@ -37,7 +37,7 @@ class SystemRows(NamedTuple):
 @deferred
 @defined
 def close_system(system: Any, t: Array, q: Vector, v: Vector) -> tuple[Any, ...]:
-    """Close a state of a system.
+    """Return a state of a system with Psi = 0, Psi_dot = 0 and phi = 0, near a given one, with its residuals.
 
     Args:
         system: The system, of traced functions.

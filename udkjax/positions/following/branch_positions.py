@@ -26,7 +26,15 @@ from udkjax.transforms.gradients import stop_gradients
 def start_on_branch(
     mechanism: Mechanism, driver: Drive, start: NumberLike, state: State | None, held: Mapping[str, NumberLike] | None
 ) -> tuple[Driven, Float[Array, "n"]]:
-    """Return the driven mechanism and its closed first position; if time is the driver, at time `start`."""
+    """Return the driven mechanism, and the closed position near `state` from which it is followed.
+
+    Args:
+        mechanism: the mechanism.
+        driver: a driver or coordinate; None: all drivers, along time.
+        start: the time (s) at which the position is closed if `driver` is None.
+        state: a state near the position; None: the initial guess.
+        held: values that other drivers or coordinates hold, by name.
+    """
     driven = drive(mechanism, driver, 0.0, held)
     if driver is None:
         return driven, _assemble(driven.mechanism, start, state, driven.analysis)
@@ -45,7 +53,10 @@ def _assemble(mechanism: Mechanism, t: NumberLike, state: State | None, analysis
 def solve_on_branch(
     driven: Driven, s: Float[Array, ""], q: Float[Array, "n"], values: Float[Array, "T"], by: ControlFlow, fast: bool = True
 ) -> Points:
-    """Solve by machine code (if `fast`) as long as its steps are reliable, then by continuation."""
+    """Return the positions at the values, followed from the position q at the value s.
+
+    If `fast`, machine code computes them as long as its steps are reliable. Continuation computes the others.
+    """
     xp, is_traced = by.xp, by is BY_JAX
     curve = (Curve if is_traced else NumpyCurve).of(driven)
     points, first = no_points(len(values), len(q), xp), xp.asarray(0)
@@ -71,10 +82,11 @@ def solve_on_branch(
 def _count_on_branch(
     curve: AbstractCurve, s: Float[Array, ""], q: Float[Array, "n"], values: Float[Array, "T"], march_result: MarchResult
 ) -> Int[Array, ""] | int:
-    """Return the number of trusted positions that are on the first branch.
+    """Return the number of positions from the first one on that machine code trusts and that are on the branch of the start.
 
     The side changes where the branch meets another, and where machine code jumps to a neighbouring branch. Continuation with
-    shorter steps distinguishes the two: for concrete numbers from the previous value, for traced ones from this value on.
+    shorter steps distinguishes the two cases. For concrete numbers it does so here, beginning at the previous value; for traced
+    numbers positions are counted up to the first change, and continuation computes the others.
     """
     if isinstance(curve, Curve):
         is_same_side = march_result.side == march_result.first_side

@@ -75,7 +75,10 @@ SAME_POSITION = 1e-5  # tolerance, relative to the characteristic length or in r
 
 
 def random_positions(mechanism: Mechanism, count: int, seed: int, state: State | None = None) -> Float[Array, "count bodies 3"]:
-    """Return the given position, and others with random angles and places of bodies within the size of the mechanism."""
+    """Return the position of `state`, by default the initial guess, and random ones around it, `count` in total, none closed.
+
+    Angles are arbitrary, and places vary within the size of the mechanism.
+    """
     rng = np.random.default_rng(int(seed))
     q = np.asarray(mechanism.q0 if state is None else state.q)
     positions = np.tile(q, (count, 1, 1))

@@ -1,7 +1,7 @@
-"""Bodies connected to a single other body: a wheel on its axle, a pendulum on a link.
+"""Carried bodies, which are connected to a single other body, their carrier: a wheel on its axle, a pendulum on a link.
 
-The other body, the carrier, can move them rigidly with itself without opening their joints. They thus limit no coordinate of the
-other bodies, whose positions are computed as if the carried bodies were absent.
+If a carrier moves, the bodies that it carries can move rigidly with it without opening their joints. So carried bodies limit no
+coordinate of the other bodies, whose positions are computed as if the carried ones were absent.
 """
 
 from collections.abc import Mapping
@@ -29,12 +29,12 @@ ANY_MOTION = (
 
 
 class CarriedBodies(NamedTuple):
-    """The carried bodies, which are left out, each with its carrier, by index; -1: the ground."""
+    """The carried bodies of a mechanism: `carrier` has the index of each, with the index of its carrier; -1 is the ground."""
 
     carrier: dict[int, int]
 
     def without(self, mechanism: Mechanism) -> Mechanism:
-        """Return the mechanism without these bodies, and without forces, since positions do not depend on forces."""
+        """Return the mechanism without the carried bodies, and without forces, on which positions do not depend."""
         names = [mechanism.body_names[k] for k in self.carrier]
         keeps = lambda element: not set(names) & set(mechanism.frames_of(element))  # noqa: E731
         joints = {name: x for name, x in mechanism.joints.items() if keeps(x)}
@@ -45,11 +45,14 @@ class CarriedBodies(NamedTuple):
         return Mechanism(bodies, joints, drivers, {}, mechanism.gravity, mechanism.name, origin)
 
     def kept(self, count: int) -> np.ndarray:
-        """Return the indices of all other bodies, out of `count`."""
+        """Return the indices of the bodies that are not carried, in a mechanism of `count` bodies."""
         return np.array([k for k in range(count) if k not in self.carrier], int)
 
     def carry(self, start: Float[Array, "bodies 3"], others: Float[Array, "kept 3"]) -> Float[Array, "bodies 3"]:
-        """Return the positions of all bodies: carried ones keep their pose relative to their carriers at the start."""
+        """Return the positions of all bodies: carried ones have the same pose relative to their carriers as at the start.
+
+        If `others`, the positions of the bodies that are not carried, are not finite, all positions are infinite.
+        """
         xp, kept = library_for((start, others)), self.kept(len(start))
         is_reached = xp.all(xp.isfinite(others))
         poses = dict(zip(kept.tolist(), xp.where(is_reached, others, 0.0), strict=True))
@@ -65,7 +68,7 @@ class CarriedBodies(NamedTuple):
 
 
 def carried_bodies(mechanism: Mechanism, driver: str | Coordinate, held: Mapping[str, NumberLike] | None) -> CarriedBodies:
-    """Return the bodies connected to a single other body, if degrees of freedom remain while a coordinate is driven.
+    """Return the carried bodies of a mechanism, if degrees of freedom remain while a coordinate is driven, else no bodies.
 
     With all numbers traced, the degrees of freedom are unknown and no bodies are returned.
     """
@@ -91,7 +94,10 @@ def carried_bodies(mechanism: Mechanism, driver: str | Coordinate, held: Mapping
 
 
 def _parts_without(body: int, groups: list[set[int]], count: int) -> list[set[int]]:
-    """Return the sets of bodies that remain connected once one body is removed; the ground is -1."""
+    """Return the sets of bodies that are connected with each other without one body; `groups` has the bodies of each constraint.
+
+    The ground is -1.
+    """
     parts = [{k} for k in range(-1, count) if k != body]
     for group in groups:
         joined = [part for part in parts if part & group]
@@ -101,7 +107,7 @@ def _parts_without(body: int, groups: list[set[int]], count: int) -> list[set[in
 
 
 def _is_carried(mechanism: Mechanism, part: set[int], carrier: int) -> bool:
-    """Return True if the constraints of a part stay closed when it moves rigidly with its carrier."""
+    """Return True if the constraints of a set of bodies, `part`, stay closed when it moves rigidly with its carrier."""
     rows, names = KinematicRows(mechanism), mechanism.body_names
     moving = {names[k] for k in part}
     of_part = [name for name, x in mechanism.constraints.items() if moving & set(mechanism.frames_of(x))]

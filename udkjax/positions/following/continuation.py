@@ -45,7 +45,7 @@ T = TypeVar("T")
 
 
 class Reached(PrintsWords):
-    """Outcome for one value of a driver."""
+    """The outcome of following a branch to one value of a driver."""
 
     closed = 0
     singular = 1  # closed; branches meet, and velocities on the followed branch are interpolated from both sides
@@ -61,7 +61,10 @@ class Reached(PrintsWords):
 
 
 class Points(NamedTuple):
-    """Positions over the values, their derivatives with respect to the value, statuses, and the toggle if the motion met one."""
+    """Positions at the values of a driver, their derivatives with respect to the value, and a `Reached` for each value.
+
+    If the motion ended at a toggle, `limit` and `limit_q` are its value and its position.
+    """
 
     q: Float[Array, "T n"]
     dq: Float[Array, "T n"]
@@ -108,7 +111,7 @@ def follow(
     points: Points,
     first: int | Int[Array, ""],
 ) -> Points:
-    """Compute positions at values[first:] in sequence, from the position q at the value s; `points` has the earlier positions.
+    """Return `points` with the positions at values[first:], followed in sequence from the position q at the value s.
 
     Members of a batch run one after another: in lockstep all would take as many steps as the slowest. No derivatives.
     """
@@ -158,7 +161,7 @@ def _follow(
 
 
 def _try(curve: AbstractCurve, targets: Float[Array, "T"], most: int, state: _State) -> _State:
-    """Correct one point: the start, the end of a step towards the next value or at this value, or a point of a search.
+    """Return the state after a trial, which corrects one point: the start, the end of a step, or a point of a search.
 
     All use a single call of the corrector, since each traced call adds compile time.
     """
@@ -222,7 +225,7 @@ def _advance(
     clearance: Float[Array, ""],
     max_trials: int,
 ) -> _State:
-    """Return the state after a step of length eta, if the step is accepted.
+    """Return the state after a step of length eta; if the step is not accepted, the old state with a shorter next step.
 
     `predicted` is the prediction, and `corrected` the corrected point, with the tangent `tangent`. The target is in the direction
     with the sign `way`; a step that `lands` ends at the target's value.
@@ -305,12 +308,12 @@ def _narrow(
 
 
 def _at_seldom(curve: AbstractCurve, function: Callable[..., T], *arguments: Array) -> T:
-    """Return function(curve, *arguments), which is rarely evaluated."""
+    """Return function(curve, *arguments); in a traced program the host evaluates it, so that it need not be compiled."""
     return function(curve, *arguments) if curve.by.xp is np else call_seldom(function, curve, *arguments)
 
 
 def _record(curve: AbstractCurve, state: _State) -> _State:
-    """Store the point of the curve if it has the next value and is not the start.
+    """Return the state in which the current point is stored if it has the next value and is not the start.
 
     Near a meeting of branches, the point and its derivatives are interpolated from points of the branch on both sides.
     """

@@ -63,14 +63,14 @@ class Crossing(NamedTuple):
 
 
 def _has_digits(curve: AbstractCurve, X: Array, tau: Array) -> Bool[Array, ""]:
-    """Return whether enough digits of q'' are correct without interpolation."""
+    """Return True if enough digits of q'' are correct without interpolation."""
     by, xp, rule = curve.by, curve.by.xp, CLOSURE.digits
     sigma = by.map(curve.clearance, X + rule.arc * xp.array([0.0, -1.0, 1.0])[:, None] * tau)
     return rule.hold(sigma[0], xp.max(xp.abs(sigma - sigma[0])) / rule.arc)
 
 
 def find_crossing(curve: AbstractCurve, X: Float[Array, "n+1"], tau: Float[Array, "n+1"]) -> tuple[Crossing, Bool[Array, ""]]:
-    """Return a point with q', q'' and q''', interpolated from both sides.
+    """Return a point of the branch with q', q'' and q''', interpolated from points on both sides.
 
     Args:
         curve: the curve.
@@ -78,7 +78,7 @@ def find_crossing(curve: AbstractCurve, X: Float[Array, "n+1"], tau: Float[Array
         tau: the approximate direction of the branch.
 
     Returns:
-        The crossing, and whether it is accepted; it is not if it is not needed.
+        The crossing, and whether it is accepted; False if q'' is accurate enough without interpolation.
     """
 
     def tried(h: Float[Array, ""]) -> tuple[Array, Array, Array, Array, Array]:
@@ -117,7 +117,7 @@ def find_toggle(curve: AbstractCurve, X: Float[Array, "n+1"], tau: Float[Array, 
 
 
 def _extremum(curve: AbstractCurve, X: Array, tau: Array, h: Array) -> tuple[Array, Array]:
-    """Return the extremum of the value from points h apart, and an error bound, accepted below one."""
+    """Return the point with the extreme value, from points h apart along tau, and an error bound; below 1 it is accepted."""
     by, xp = curve.by, curve.by.xp
     first_offsets = NEAREST_NODE * h * xp.array([-1.0, 1.0])[:, None] * tau
 
@@ -159,7 +159,7 @@ def _evaluate_at(x: Array, coefficients: list[Array], abscissas: Array) -> tuple
 
 
 def _interpolate(curve: AbstractCurve, X: Array, tau: Array, h: Array) -> tuple[Array, Array, Array, Array, Array]:
-    """Return the point, q', q'' and q''' from values h apart, and an error bound, accepted below one."""
+    """Return the point with the value of X, q', q'' and q''', from values h apart, and an error bound, accepted below 1."""
     by, xp = curve.by, curve.by.xp
     slope = tau / xp.where(tau[-1] != 0, tau[-1], 1.0)
     signs = xp.array([-1.0, 1.0])

@@ -31,7 +31,7 @@ _Correction = tuple[Any, Any, Any]  # X, corrections so far, whether it is close
 
 
 class AbstractCurve(ABC):
-    """Positions of a driven mechanism as a curve in scaled coordinates and value."""
+    """The positions of a driven mechanism as a curve of points X = (q, s), each coordinate and the value s in its unit."""
 
     weights: Any  # weights of the rows
     units: Any  # units of the coordinates and the value
@@ -42,11 +42,11 @@ class AbstractCurve(ABC):
 
     @abstractmethod
     def residual(self, X: Float[Array, "n+1"]) -> Float[Array, "m"]:
-        """Return the weighted rows of Psi."""
+        """Return Psi, with each row times its weight."""
 
     @abstractmethod
     def slopes(self, X: Float[Array, "n+1"]) -> Float[Array, "m n+1"]:
-        """Return E, the derivatives of the residual."""
+        """Return E, the derivatives of the residual by X."""
 
     @abstractmethod
     def plus(self, E: Float[Array, "m n"], tol: float = RANK_TOL) -> Any:
@@ -54,14 +54,14 @@ class AbstractCurve(ABC):
 
     @abstractmethod
     def inverse_singular_values(self, plus: Any) -> Float[Array, "k"]:
-        """Return 1/sigma of E^+ in the order of descending sigma, zero where truncated."""
+        """Return 1/sigma of the matrix with the pseudoinverse `plus`, in descending order of sigma; zero where truncated."""
 
     @abstractmethod
     def gamma(self, s: Float[Array, ""], q: Float[Array, "n"], v: Float[Array, "n"]) -> Float[Array, "m"]:
-        """Return gamma: accelerations with Psi_q a = gamma keep Psi_dot at zero."""
+        """Return gamma, for which Psi_q a = gamma is the second derivative of Psi = 0, at the value s and the rates v = dq/ds."""
 
     def is_closed(self, X: Float[Array, "n+1"]) -> Bool[Array, ""]:
-        """Return True if the residual is rounding."""
+        """Return True if the violation at X is within rounding errors."""
         return self.violation(X) <= self.rounding(X)
 
     def rounding(self, X: Float[Array, "n+1"]) -> Float[Array, ""]:
@@ -69,12 +69,12 @@ class AbstractCurve(ABC):
         return CLOSURE.rounding * float(np.finfo(X.dtype).eps) * self.by.xp.maximum(1.0, abs(X).max())
 
     def violation(self, X: Float[Array, "n+1"]) -> Float[Array, ""]:
-        """Return the largest row of |Psi|, each relative to its scale."""
+        """Return the largest |Psi| of all rows, each relative to its scale."""
         return abs(self.residual(X) / (self.weights * self.rows)).max(initial=0.0)
 
     @abstractmethod
     def correct(self, X: Float[Array, "n+1"], fixed: Bool[Array, ""] | bool = False) -> tuple[Array, Bool[Array, ""]]:
-        """Return the nearest point of the curve, with the same value if `fixed`, and whether Newton's method converged.
+        """Return the nearest point of the curve, with the same value s if `fixed`, and whether Newton's method converged.
 
         The last step corrects a closed point once more.
         """
@@ -90,7 +90,7 @@ class AbstractCurve(ABC):
         return sigma[len(X) - 2] / xp.where(sigma[0] > 0, sigma[0], 1.0)
 
     def tangent(self, X: Float[Array, "n+1"], before: Float[Array, "n+1"]) -> tuple[Array, Array, Array]:
-        """Return the tangent in the direction of the previous one, its side of a meeting of branches, and the clearance.
+        """Return the unit tangent tau in the direction of the one before, the side of the point, and its clearance.
 
         The side is the sign of det [E; tau] of independent rows, +-1: along a branch it changes only where the branch meets
         another, not at toggles. It is 1 if the independent rows are unknown. The clearance is `clearance(X)` from the same
@@ -119,7 +119,7 @@ class AbstractCurve(ABC):
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Curve(AbstractCurve):
-    """Positions of a mechanism whose numbers may be traced."""
+    """The positions of a driven mechanism whose numbers may be traced, as a curve, by JAX."""
 
     mechanism: Mechanism
     weights: Float[Array, "m"]
@@ -175,7 +175,7 @@ class Curve(AbstractCurve):
 
 @dataclass(frozen=True)
 class NumpyCurve(AbstractCurve):
-    """Positions of a mechanism of concrete numbers, by NumPy on the scene's programs; nothing is compiled."""
+    """The positions of a driven mechanism of concrete numbers, as a curve, by NumPy on the scene's programs without compiling."""
 
     terms: DenseTerms
     weights: Float[np.ndarray, "m"]
@@ -188,7 +188,7 @@ class NumpyCurve(AbstractCurve):
 
     @staticmethod
     def of(driven: Driven) -> "NumpyCurve":
-        """Return the curve, made once for each mechanism and analysis."""
+        """Return the curve of a driven mechanism, which is cached for its mechanism, analysis and unit."""
         return _curve_of_concrete(driven.mechanism, driven.analysis, np.asarray(driven.unit).item())
 
     @classmethod
@@ -213,7 +213,7 @@ class NumpyCurve(AbstractCurve):
         return np.zeros(len(self.rows))
 
     def _geometry(self, X: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return Psi, Psi_s and the entries of Psi_q."""
+        """Return Psi, Psi_s and the nonzero entries of Psi_q, unscaled."""
         x = X * self.units
         return self.terms.geometry(x[-1], x[:-1], self._at_rest)
 
@@ -245,7 +245,7 @@ class NumpyCurve(AbstractCurve):
         return self.terms.gamma(s, q, v)
 
     def correct(self, X: Any, fixed: Any = False) -> tuple[Any, Any]:
-        """Return X corrected as by `Curve`, and whether it is closed: a closed point by the pseudoinverse of the step before."""
+        """Return the results of `AbstractCurve.correct`; a closed point is corrected by the pseudoinverse of the step before."""
         if not len(self.rows):
             return X, np.True_
         if fixed and (corrected := self._eliminate(X)) is not None:

@@ -62,7 +62,7 @@ class Driven(NamedTuple):
 
     @property
     def value_unit(self) -> str:
-        """The unit of s."""
+        """The unit of s: "rad", "m" or "s"."""
         return "rad" if self.is_angle else "m" if self.name else "s"
 
     def value(self, q: Float[Array | np.ndarray, "n"] | Float[Array | np.ndarray, "bodies 3"]) -> Float[Array, ""]:
@@ -73,10 +73,10 @@ class Driven(NamedTuple):
 
 
 def drive(mechanism: Mechanism, driver: Drive, t: NumberLike = 0.0, held: Mapping[str, NumberLike] | None = None) -> Driven:
-    """Return the mechanism driven by one coordinate; other drivers keep their values of time t (s).
+    """Return a mechanism as driven by one coordinate, while other drivers keep their values of time t (s).
 
-    `held` has other values for them, or values of further coordinates, by name. Raises `SceneError` if there is no such driver or
-    coordinate, or positions do not follow from its value.
+    `held` has, by name, other values for these drivers, or values of further coordinates. If `driver` is None, all drivers move
+    along time. Raises `SceneError` if there is no such driver or coordinate, or positions do not follow from its value.
     """
     refuse_rolling(mechanism, "positions do not follow from a driver")
     if not mechanism.is_concrete or is_traced((driver, t, held)):
@@ -87,7 +87,7 @@ def drive(mechanism: Mechanism, driver: Drive, t: NumberLike = 0.0, held: Mappin
 
 @cached_by_identity
 def _drive_concrete(mechanism: Mechanism, driver: Drive, t: float, *held: Any) -> Driven:
-    """Return the driven mechanism; `held` has names and values in turn, which the cache compares by value."""
+    """Return the result of `drive` for concrete numbers; `held` has names and values in turn, which the cache compares."""
     with jax.ensure_compile_time_eval():  # concrete even while something else is traced
         return _drive(mechanism, driver, t, dict(zip(held[::2], held[1::2], strict=True)))
 
@@ -128,7 +128,7 @@ def _drive(mechanism: Mechanism, driver: Drive, t: NumberLike, held: Mapping[str
 
 
 def constant_speed(mechanism: Mechanism, driver: str) -> float:
-    """Return the constant speed (rad/s, m/s) of a driver; 0 if its speed is not constant, or for another coordinate."""
+    """Return the constant speed (rad/s, m/s) of a driver; 0 if its speed is not constant, or if there is no such driver."""
     motion = mechanism.drivers[driver].motion if driver in mechanism.drivers else None
     return float(np.asarray(motion.coefficients)[1]) if isinstance(motion, Polynomial) and len(motion.coefficients) == 2 else 0.0
 
@@ -145,7 +145,7 @@ def only_driver(mechanism: Mechanism) -> str:
 
 
 def without_drivers(mechanism: Mechanism, forces: Mapping[str, ForceElement] | None = None) -> Mechanism:
-    """Return the mechanism without its drivers, with these forces instead of its own if any are given."""
+    """Return the mechanism without its drivers; if `forces` is not None, these replace its forces."""
     return _without_drivers(mechanism) if forces is None else _with_forces_alone(mechanism, forces)
 
 
@@ -161,7 +161,7 @@ def _with_forces_alone(mechanism: Mechanism, forces: Mapping[str, ForceElement] 
 
 
 def _add_driver(mechanism: Mechanism, name: str, element: Coordinate, t: NumberLike) -> Mechanism:
-    """Return the mechanism with a driver of this name that follows the value s; all other drivers hold their values."""
+    """Return the mechanism with a driver of this name that follows the value s; all others hold their values of time t (s)."""
     concrete = mechanism.origin and mechanism.origin.mechanism
     with jax.ensure_compile_time_eval():
         origin = concrete and Origin(_add_driver(concrete, name, _concrete_element(concrete, name, element), _value_or(t, 0.0)))
@@ -169,7 +169,7 @@ def _add_driver(mechanism: Mechanism, name: str, element: Coordinate, t: NumberL
 
 
 def with_halted_drivers(mechanism: Mechanism, t: NumberLike, q: Any = None) -> Mechanism:
-    """Return the mechanism with its drivers halted at time t (s), or in a position q (bodies, 3)."""
+    """Return the mechanism whose drivers hold their values of time t (s), or those of a position q (bodies, 3) if it is given."""
     return mechanism.with_drivers(_halted(mechanism, t, q))
 
 
@@ -182,7 +182,7 @@ def _halted(mechanism: Mechanism, t: NumberLike, q: Any = None) -> dict[str, Dri
 
 
 def _with_driver(mechanism: Mechanism, name: str, element: Coordinate, motion: Polynomial) -> Mechanism:
-    """Return the mechanism with one more driver, or with another motion of an existing one."""
+    """Return the mechanism with a driver of this name, coordinate and motion, which replaces a driver of the same name."""
     drivers = {**mechanism.drivers, name: element.driver(motion)}
     concrete = mechanism if mechanism.is_concrete else mechanism.origin and mechanism.origin.mechanism
     result = with_drivers(mechanism, drivers)
@@ -202,7 +202,10 @@ def with_drivers(
     forces: Mapping[str, ForceElement] | None = None,
     origin: Origin | None = None,
 ) -> Mechanism:
-    """Return the mechanism with these drivers, and with these forces instead of its own if any are given."""
+    """Return the mechanism with `drivers` instead of its drivers and, if `forces` is not None, `forces` instead of its forces.
+
+    If numbers are traced, `origin` is the concrete mechanism from which redundant rows are determined.
+    """
     if forces is None and not drivers:
         return mechanism.with_drivers({}, origin)
     changed = {"driver": drivers} if forces is None else {"driver": drivers, "force": forces}
@@ -210,14 +213,17 @@ def with_drivers(
 
 
 def _concrete_element(concrete: Mechanism, name: str, element: Coordinate) -> Coordinate:
-    """Return a coordinate with a concrete axis and concrete points."""
+    """Return a coordinate with a concrete axis and points: those of the driver of this name, or zeros for traced ones."""
     if name in concrete.drivers:
         return Coordinate.of(concrete.drivers[name])
     return jax.tree.map(lambda x: jnp.zeros(x.shape) if isinstance(x, Tracer) else x, element)
 
 
 def _from_guess(mechanism: Mechanism, name: str) -> Mechanism:
-    """Return the mechanism whose driver starts from its value in the initial guess, since an analysis closes it at time zero."""
+    """Return the concrete mechanism, if known, with the named driver at its value of the initial guess at time zero.
+
+    An analysis closes the mechanism at time zero.
+    """
     mechanism = mechanism if mechanism.origin is None else mechanism.origin.mechanism
     with _at_once(mechanism):
         value = jax.lax.stop_gradient(value_of(mechanism, name)(mechanism.q0))
@@ -226,7 +232,7 @@ def _from_guess(mechanism: Mechanism, name: str) -> Mechanism:
 
 
 def _at_once(given: PyTree) -> AbstractContextManager:
-    """Compute at once with concrete numbers, even while something else is traced."""
+    """Return a context in which JAX evaluates at once even while something else is traced, if `given` is concrete."""
     traced = is_traced(given)
     return nullcontext() if traced else jax.ensure_compile_time_eval()
 
@@ -245,7 +251,7 @@ def _require_determinate(mechanism: Mechanism, analysis: Analysis, driven: str) 
 
 
 def free_motion(mechanism: Mechanism) -> dict[str, Bool[np.ndarray, "3"]]:
-    """Return which coordinates x, y, angle of each body can move at the initial guess."""
+    """Return for each body a mask of the coordinates x, y, angle that can move at the initial guess."""
     rows = KinematicRows(mechanism)
     free = null_space(rows.at(0.0, np.ravel(mechanism.q0))[2], MOVES)
     moves = np.linalg.norm(free, axis=0).reshape(-1, 3) > MOVES
@@ -253,7 +259,7 @@ def free_motion(mechanism: Mechanism) -> dict[str, Bool[np.ndarray, "3"]]:
 
 
 def _suggested_coordinate(mechanism: Mechanism) -> str:
-    """Return the name of a coordinate that moves and can be driven, preferably an angle; any if numbers are traced."""
+    """Return the name of a coordinate that moves and can be driven, preferably an angle; if numbers are traced, of any angle."""
     moves = free_motion(mechanism) if mechanism.is_concrete else {}
     free = [f"body.{body}.{name}" for k, name in ((2, "angle"), (0, "x"), (1, "y")) for body in moves if moves[body][k]]
     return (free or [f"body.{mechanism.body_names[0]}.angle"])[0]

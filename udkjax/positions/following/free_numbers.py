@@ -46,7 +46,7 @@ class FreeNumbers:
 
     @property
     def vector(self) -> Float[np.ndarray, "P"]:
-        """The numbers of the mechanism."""
+        """The values of the free numbers in the mechanism, as one vector."""
         return np.concatenate([np.zeros(0), *(np.ravel(x) for x in self.values)])
 
     def entries(self) -> list[str]:
@@ -57,12 +57,15 @@ class FreeNumbers:
         return found
 
     def split(self, x: Array | np.ndarray) -> dict[str, Array | np.ndarray]:
-        """Return the numbers of a vector (..., P) by name."""
+        """Return the numbers by name whose entries are in vectors (..., P), each with its shape after the leading axes."""
         parts = zip(self.names, self.values, self.starts, self.starts[1:], strict=False)
         return {name: x[..., a:b].reshape((*x.shape[:-1], *np.shape(value))) for name, value, a, b in parts}
 
     def join(self, values: Mapping[str, object]) -> Float[np.ndarray, "M P"]:
-        """Return vectors of numbers given by name, each (M, ...); raise `SceneError` if one is missing or has another shape."""
+        """Return a vector for each of M members, from numbers (M, ...) by name.
+
+        Raises a `SceneError` if a number is missing, is not free, or has the wrong shape.
+        """
         problems, arrays = [], []
         sizes = {len(x) for x in map(np.asarray, values.values()) if x.ndim}
         for name, value in zip(self.names, self.values, strict=True):
@@ -81,7 +84,7 @@ class FreeNumbers:
         return np.concatenate(arrays, 1)
 
     def moved(self, x: Array) -> Mechanism:
-        """Return the mechanism with these numbers, which may be traced."""
+        """Return the mechanism with the free numbers of the vector x, which may be traced."""
         return self.mechanism.with_parameters(self.split(x))
 
 
@@ -92,12 +95,14 @@ def position_model(
     origin: Callable[[Mechanism], Array] | None = None,
     shifted: bool = False,
 ) -> Callable[..., dict[str, jax.Array]]:
-    """Return the model from which position programs are traced (equations/programs/position_programs.py).
+    """Return the function from which position programs are traced (equations/programs/position_programs.py).
+
+    It has the arguments x, s, q and data, and returns Psi, q0 and s0 of the initial guess, and measures, by name.
 
     Args:
-        free: the numbers x.
-        driver: the driver of the mechanism.
-        measures: function of the mechanism, x, q (bodies, 3) and data.
+        free: the free numbers, whose vector is x.
+        driver: the driver of the mechanism, whose value is s plus its origin.
+        measures: a function of the mechanism, x, q (bodies, 3) and data that returns the numbers to be measured.
         origin: the driver's value at s = 0, as a function of the mechanism; by default zero.
         shifted: whether x has one more entry, which is added to s.
     """

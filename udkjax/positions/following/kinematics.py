@@ -86,7 +86,7 @@ class Kinematics(PrintsTable):
         return stored(self.v / self.rate[..., None, None])
 
     def in_order(self) -> "Kinematics":
-        """Return the motion with its values, which are concrete, in rising order, each once."""
+        """Return the motion with its values, which are concrete, in increasing order, without duplicates."""
         order = np.unique(np.asarray(without_derivatives(self.values)), return_index=True)[1]
         if np.array_equal(order, np.arange(len(self.values))):
             return self
@@ -94,7 +94,7 @@ class Kinematics(PrintsTable):
         return make_module(Kinematics, **vars(self) | {name: getattr(self, name)[order] for name in states})
 
     def frame(self, body: str) -> Frame:
-        """Return the frame of a body, each of its numbers (T,)."""
+        """Return the frame of a body over the motion; each of its entries has the shape (T,)."""
         return frame_over_time(self.bodies, self.q, self.v, body)
 
     def path(self, body: str, point: Numbers = (0.0, 0.0)) -> Float[Array, "T 2"]:

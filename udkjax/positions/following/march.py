@@ -26,11 +26,11 @@ DEPENDENT = 1e-10  # remainder of a dependent row, relative to its square; a mar
 
 
 class MarchResult(NamedTuple):
-    """Positions and their derivatives with respect to the value; the first `trusted` of them are closed and on one smooth curve.
+    """Positions at the values of a driver, with two derivatives; the first `trusted` of them are closed and on one smooth curve.
 
-    `side` is the sign of det Psi_q, or 1 if Psi_q is not square or the independent rows are unknown, and zero where it has
-    changed more than once since the value before; `first_side` is the side of the start. After the trusted positions, all are
-    the last one that was followed, at the value `reached`.
+    `side` is the sign of det Psi_q at each value: 1 if Psi_q is not square or the independent rows are unknown, and zero where
+    the sign has changed more than once since the value before. `first_side` is the sign at the start. All positions after the
+    trusted ones are the last position that was followed, at the value `reached`.
     """
 
     q: Float[Array, "T n"]
@@ -43,7 +43,7 @@ class MarchResult(NamedTuple):
 
 
 def can_march(mechanism: Mechanism, analysis: Analysis) -> bool:
-    """Return True if machine code supports the mechanism."""
+    """Return True if machine code can follow positions of the mechanism: it supports all elements, and JAX uses float64."""
     return jax.config.jax_enable_x64 and _is_supported(mechanism, analysis)
 
 
@@ -56,9 +56,9 @@ def _is_supported(mechanism: Mechanism, analysis: Analysis) -> bool:
 def march(
     mechanism: Mechanism, analysis: Analysis, unit: NumberLike, s: NumberLike, q: NumericArray, values: NumericArray
 ) -> MarchResult:
-    """Follow the positions over the values, from the closed position q at the value s, without derivatives.
+    """Return the positions at the values, followed from the closed position q at the value s; they have no derivative rules.
 
-    The value of the driver replaces time; `unit` is the unit of the values.
+    The value of the driver replaces time; `unit` is its unit (`Driven.unit`).
     """
     inputs = _inputs(_numbers(mechanism, analysis), analysis, unit, s, q, values, jnp)
     return _march(native_p.bind(*inputs, operation=_operation(mechanism, analysis), times=1 + np.size(values)), jnp)
@@ -67,7 +67,7 @@ def march(
 def march_at_once(
     mechanism: Mechanism, analysis: Analysis, unit: NumberLike, s: NumberLike, q: NumericArray, values: NumericArray
 ) -> MarchResult:
-    """Follow positions as `march` does, for concrete numbers, by NumPy; nothing is traced or compiled."""
+    """Return the results of `march` for concrete numbers, as NumPy arrays; JAX traces and compiles nothing."""
     prepared, analysis = _numbers_of_concrete(mechanism, analysis)
     inputs = _inputs(prepared, analysis, unit, s, q, values, np)
     return _march(prepared.calls.of_one(*inputs, times=1 + len(values)), np)
@@ -84,7 +84,7 @@ def _march(outputs: Sequence, xp: ModuleType) -> MarchResult:
 
 
 class _Prepared(NamedTuple):
-    """The operation of a mechanism and its first input: the numbers of the scene, and the two thresholds of pivots."""
+    """The operation of a mechanism, its first input (the numbers of the scene, and two thresholds of pivots), and calls of it."""
 
     operation: March
     numbers: list[Any]
@@ -104,7 +104,7 @@ def _calls(operation: March) -> MemberCalls:
 
 @cached_by_identity
 def _numbers_of_concrete(mechanism: Mechanism, analysis: Analysis) -> tuple[_Prepared, Analysis]:
-    """Return the numbers of a concrete mechanism as one array, and its analysis by NumPy."""
+    """Return the operation and the numbers of a concrete mechanism, and its analysis with NumPy arrays."""
     analysis, scene, operation = jax.tree.map(_by_numpy, analysis), _without_loads(mechanism), _operation(mechanism, analysis)
     numbers = np.concatenate([np.ravel(x) for x in scene.numbers])
     programs = scene_programs(scene, analysis.redundant_rows or (), in_pieces=False)
@@ -128,7 +128,7 @@ def _inputs(
 
 
 def _without_loads(mechanism: Mechanism) -> Mechanism:
-    """Return the mechanism with all sampled loads zero: positions do not depend on them."""
+    """Return the mechanism with all sampled loads replaced by zero: positions do not depend on them."""
     loads = {key: x for key, x in mechanism.samples.items() if key[0] == "_forces"}
     return mechanism.with_samples({key: with_row(x, np.zeros(row_size(x))) for key, x in loads.items()})
 

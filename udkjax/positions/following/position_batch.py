@@ -26,13 +26,13 @@ class BatchPositions(PrintsTable):
 
     Attributes:
         q: x, y (m) and angle (rad) of each body, (M, T, bodies, 3).
-        dq: their derivatives with respect to the value, (M, T, bodies, 3); None if not requested.
-        by_parameters: their derivatives with respect to the free numbers, (M, T, bodies, 3, P), in the order of `entries`; or
-            None.
+        dq: derivatives of q with respect to the value, (M, T, bodies, 3); None if not requested.
+        by_parameters: derivatives of q with respect to the free numbers, (M, T, bodies, 3, P), in the order of `entries`; None if
+            not requested.
         reached: whether a member reached a value (M, T).
         transmission: distance of a position from a meeting of branches (M, T), from 0 to 1, with the sign of the branch; for a
             four-bar the sine of the transmission angle.
-        entries: the names of the P numbers.
+        entries: the names of the P entries of the free numbers.
         bodies: the names of the bodies.
     """
 
@@ -138,7 +138,15 @@ def compile_positions(
 ) -> tuple[PositionPrograms, PositionCode]:
     """Return the programs of a model, and their machine code.
 
-    Raises `SceneError` if positions do not follow from the driver, or an operation has no instruction.
+    Args:
+        mechanism: the mechanism, which errors name.
+        model: the traced function of `position_model`.
+        parameters: the number of parameters x.
+        coordinates: the number of coordinates q.
+        **choices: other arguments of `PositionPrograms`.
+
+    Raises:
+        SceneError: positions do not follow from the driver, or machine code has no instruction for an operation.
     """
     try:
         programs = PositionPrograms(model, parameters, coordinates, **choices)

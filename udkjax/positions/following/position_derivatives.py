@@ -64,7 +64,7 @@ def _(primals, tangents):
     changes, changed = jax.tree.flatten(eqx.combine(tangents[:2], zeros))
 
     def regular_change(value: Array, at: tuple[Array, Array, Array], *ds: Array) -> list[Array]:
-        """Return the changes of q, q' and q'' at one value, undefined where these are."""
+        """Return the changes of q, q' and q'' at one value; they are NaN where the positions `at` it are NaN."""
 
         def along(directions: list[Array]) -> Sequence[Array]:
             moving = jax.tree.unflatten(changed, directions)
@@ -84,7 +84,7 @@ def _(primals, tangents):
 def _by_numbers(
     curve: Curve, values: Float[Array, "T"], found: Three, spacing: Float[Array, "T"], regular: Bool[Array, "T"], moved: Any
 ) -> Three:
-    """Return the changes of q, q' and q'' by numbers of the constraints where branches meet."""
+    """Return the changes of q, q' and q'' with changes of numbers of the constraints, where branches meet; zero elsewhere."""
     changes = jax.tree.leaves(_constraints(moved.mechanism))
     zero = jnp.zeros_like(found[0])
     if not changes:
@@ -107,7 +107,7 @@ def _constraints(mechanism: Any) -> list[Any]:
 def _matrices(
     curve: Curve, values: Array, found: Three, spacing: Array, counts: Array, active: PyTree
 ) -> tuple[Float[Array, "K 3 n P"], Float[Array, "K P n"]]:
-    """Return the changes of q, q' and q'' by P numbers where branches meet, and their residues, zero if rounding.
+    """Return the derivatives of q, q' and q'' by P numbers where branches meet, and the residues R, zero if they are rounding.
 
     Args:
         curve: the positions.
@@ -126,7 +126,7 @@ def _matrices(
 
 
 def _at_meetings(curve: Curve, values: Array, found: Three, spacing: Array, active: PyTree) -> tuple[Array, Array]:
-    """Return `_matrices` for values that are all meetings; NaN without neighbouring points."""
+    """Return the results of `_matrices` for values at which branches meet; NaN where there are no neighbouring points."""
     W, unit, steps = curve.units[:-1], curve.units[-1], nodes(FARTHEST_NODE)
     chosen, rest = eqx.partition(_constraints(curve.mechanism), active)
     numbers, unravel = ravel_pytree(chosen)
@@ -205,7 +205,7 @@ def _bind(operator: _Operator, vector: Array) -> Array:
 
 @eqx.filter_custom_jvp
 def _ends_here(factor: Float[Array, "T"], curve: Curve, values: Float[Array, "T"]) -> Float[Array, "T"]:
-    """Return zeros whose derivatives with respect to all numbers of the curve and values are the factor, zero or NaN."""
+    """Return zeros whose derivatives with respect to all numbers of the curve and all values are `factor`, which is 0 or NaN."""
     return jnp.zeros_like(factor)
 
 
@@ -225,7 +225,7 @@ def _newton(curve: Curve, s: Float[Array, ""], q: Float[Array, "n"]) -> tuple[Ar
 
 @eqx.filter_custom_jvp
 def with_derivative(curve: Curve, x: Float[Array, "n+1"]) -> Float[Array, ""]:
-    """Return the value at a toggle x = (q, s), with the derivative of the nearest point of the curve."""
+    """Return the value s at a toggle x = (q, s), with the derivatives of the value at the nearest point of the curve."""
     return x[-1]
 
 

@@ -127,7 +127,7 @@ def _travel(driven: Driven, q: Float[Array, "n"], far: NumberLike, by: ControlFl
 
 
 def _returns(driven: Driven, q: Any, points: Points) -> bool:
-    """Return True if a whole turn leads back to the position q, so that the motion has no limit in the other direction either."""
+    """Return True if the turn that ends at `points` leads back to q: then there is no limit in the other direction either."""
     if points.status[0] != Reached.closed:
         return False
     moved = (points.q[0] - q) / driven.analysis.scales.coordinates(len(q))

@@ -18,7 +18,7 @@ PlaneCorner = tuple[Array, Array]
 def gap_in_position(
     mechanism: Mechanism, shapes: Mapping[str, Any] | None, pair: tuple[str, str], q: Float[Array, "bodies 3"]
 ) -> Array:
-    """Return the gap (m) between two links, negative if they overlap; numbers may be traced.
+    """Return the gap (m) between the two links of a pair in the position q, negative if they overlap; numbers may be traced.
 
     Raises a `SceneError` if there are no such links, or an outline is missing.
     """
@@ -40,7 +40,8 @@ def _corners(names: Sequence[str], q: Array, body: str, corners: Float[Array, "n
 def signed_distance_of(A: Sequence[PlaneCorner], B: Sequence[PlaneCorner]) -> Array:
     """Return the signed distance of two convex figures by arithmetic alone, as machine code needs it.
 
-    Each figure is the hull of its corners, anticlockwise; overlaps are minus the shortest way out of each other.
+    Each figure is the hull of its corners, anticlockwise. If the figures overlap, the result is minus the length of the shortest
+    translation that separates them.
     """
     squares, separations = [], []
     for corners, others in ((A, B), (B, A)):

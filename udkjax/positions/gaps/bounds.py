@@ -1,12 +1,12 @@
 """Lower bounds of signed distances of convex parts over intervals within one polynomial of a motion.
 
 With any unit vectors n(u), the signed distance is at least min n.(b - a) over all corners a and b. Let n turn with the closest
-features at an end of the interval. If they are a corner and an edge, n is the normal of the edge. If they are two corners, with r
-from the one to the other, n = r / |r|, and n.(b - a) is |r|, plus r.(b - b') / |r| and r.(a' - a) / |r| for the other corners.
+features at an end of the interval. If these are a corner and an edge, n is the normal of the edge. If they are two corners a' and
+b', with r from a' to b', n = r / |r|, and n.(b - a) is |r|, plus r.(b - b') / |r| and r.(a' - a) / |r| for the other corners.
 
-All these are products of two vectors. Each is above the cubic with its values and slopes at both ends, minus F h^4 / 384, with F
-a bound of its fourth derivative by Leibniz's rule. So a gap that is constant, or least within the interval, is proven without
-splitting it into parts as short as bounds of the second derivative require.
+All these are products of two vectors. Each is above the cubic with the same values and slopes at both ends, minus F h^4 / 384,
+with F a bound of its fourth derivative by Leibniz's rule. So a gap that is constant, or least within the interval, is proven
+without splitting the interval into parts as short as bounds of the second derivative require.
 """
 
 from math import comb
@@ -29,15 +29,15 @@ class Moving(NamedTuple):
         return Moving(self.at - other.at, self.rate - other.rate)
 
     def dot(self, other: "Moving") -> "Moving":
-        """Return the scalar products of vectors."""
+        """Return the scalar products of these vectors with others."""
         return Moving(_dot(self.at, other.at), _dot(self.rate, other.at) + _dot(self.at, other.rate))
 
     def one(self, corner: Any, k: Any) -> "Moving":
-        """Return one corner in each of the intervals k."""
+        """Return the vectors of corners (V, 2, ends, n) of one corner in each of the intervals k: `corner` has their indices."""
         return Moving(*(np.moveaxis(x[corner, :, :, k], 0, -1) for x in self))
 
     def take(self, k: Any) -> "Moving":
-        """Return all of them in the intervals k."""
+        """Return the vectors or products in the intervals k."""
         return Moving(self.at.take(k, -1), self.rate.take(k, -1))
 
 
@@ -46,15 +46,15 @@ def _dot(x: Any, y: Any) -> Any:
 
 
 class MovingPart(NamedTuple):
-    """A convex part of each pair in n intervals.
+    """The first or the second convex part of a pair, in each of n intervals.
 
     Attributes:
-        corners: its corners (V, 2, ends, n).
-        origin: places of the origin of its body (2, ends, n).
-        turn: derivatives of its angle by u (ends, n).
+        corners: the corners in ground axes (V, 2, ends, n).
+        origin: positions of the origin of the part's body (2, ends, n).
+        turn: derivatives of the body's angle by u (ends, n).
         reach: the largest distance of a corner from the origin (n).
-        places: bounds of the derivatives of the origin (orders, n).
-        directions: bounds of unit vectors that turn with the body, and of their derivatives (1 + orders, n).
+        places: bounds of the derivatives by u of the origin (orders, n).
+        directions: bounds of unit vectors that turn with the body, and of their derivatives by u (1 + orders, n).
     """
 
     corners: Moving
@@ -66,14 +66,14 @@ class MovingPart(NamedTuple):
 
 
 def _fourth_of_product(one: Any, other: Any) -> Any:
-    """Return bounds of the fourth derivatives of products of vectors by bounds of their derivatives (1 + orders, n)."""
+    """Return bounds of the fourth derivatives of scalar products, from bounds of vectors and of derivatives (1 + orders, n)."""
     return sum(comb(ORDERS, k) * one[k] * other[ORDERS - k] for k in range(ORDERS + 1))
 
 
 def least_of_cubics(f: Moving, h: Any) -> tuple[Any, Any]:
-    """Return the least values over intervals h of cubics with given values and slopes (..., ends, n) at both ends, and where.
+    """Return the least values over intervals h of cubics with given values and slopes (..., ends, n) at both ends.
 
-    The second result is the fraction of the interval up to which the cubic falls, or to its end.
+    The second result is the fraction of the interval at which each cubic has its minimum, clipped to 0 and 1.
     """
     (f0, f1), (d0, d1) = np.moveaxis(f.at, -2, 0), np.moveaxis(f.rate, -2, 0) * h
     # f0 + d0 t + c2 t^2 + c3 t^3; its slope d0 + 2 c2 t + 3 c3 t^2 rises through zero at a minimum
@@ -87,9 +87,13 @@ def least_of_cubics(f: Moving, h: Any) -> tuple[Any, Any]:
 def bounds_by_features(
     A: MovingPart, B: MovingPart, features: Feature, h: Float[np.ndarray, "n"]
 ) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
-    """Return lower bounds of signed distances over intervals h, and the fractions of these at which they are about least.
+    """Return lower bounds of signed distances over intervals, and the fractions of the intervals at which these are about least.
 
-    `features` (ends, n) are the closest features at both ends.
+    Args:
+        A: the first part of each pair.
+        B: the second part.
+        features: the closest features (ends, n) at both ends of each interval.
+        h: the lengths of the intervals.
     """
     derivatives = A.places + A.reach * A.directions[1:] + B.places + B.reach * B.directions[1:]
     share, way = h**4 / 384, B.origin - A.origin
@@ -121,7 +125,17 @@ def bounds_by_features(
 def _bounds_by_corners(
     A: MovingPart, B: MovingPart, corner_a: Any, corner_b: Any, relative: Any, h: Any, k: Any
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return lower bounds over the intervals k by the closest corners of both parts, and where these are closest."""
+    """Return the results of `bounds_by_features` for the intervals k, at an end of which two corners are closest.
+
+    Args:
+        A: the first part of each pair.
+        B: the second part.
+        corner_a: the index of the closest corner of A in each of the intervals k.
+        corner_b: the index of the closest corner of B.
+        relative: bounds of the vectors from corners of A to those of B and of their derivatives (1 + orders, n).
+        h: the lengths of all n intervals.
+        k: the indices of the intervals.
+    """
     relative, h = relative[:, k], h[k]
     share, a, b = h**4 / 384, A.corners.one(corner_a, k), B.corners.one(corner_b, k)
     r, count, every = b - a, len(A.corners.at), np.arange(len(k))

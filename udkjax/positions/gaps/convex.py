@@ -1,8 +1,9 @@
 """Signed distances of convex figures in the plane, many at a time.
 
 A figure is the convex hull of V corners, anticlockwise: a point, a segment or a polygon; a radius around it is subtracted by the
-caller. With n from figure A to figure B, the signed distance is the largest over n of min n.(b - a). It is positive between
-separate figures, and minus the shortest way out of each other if they overlap. The last axis of all arrays counts cases.
+caller. With unit vectors n from figure A to figure B, the signed distance is the largest over n of min n.(b - a). It is positive
+between separate figures; if they overlap, it is minus the length of the shortest translation that separates them, their shortest
+way out. The last axis of all arrays is that of the cases: pairs of figures.
 """
 
 from functools import lru_cache
@@ -35,7 +36,7 @@ class Feature(NamedTuple):
 class Closest(NamedTuple):
     """Signed distances (N) of figures, unit vectors n (2, N) from A to B, and the closest features.
 
-    `row` numbers pairs of a corner and an edge, those of corners of A first; `side` and `at` are those of `Feature`.
+    `row` is the index of a pair of a corner and an edge in `_feature_table`; `side` and `at` are those of `Feature`.
     """
 
     distance: Any
@@ -45,7 +46,7 @@ class Closest(NamedTuple):
     at: Any
 
     def features(self, counts: tuple[int, int], k: Any) -> Feature:
-        """Return the features of the cases k of figures with so many corners."""
+        """Return the features of the cases k; `counts` are the numbers of corners of A and B."""
         row = self.row[k]
         of_a, corner, edge, end = (x[row] for x in _feature_table(*counts)[:4])
         return Feature(of_a, corner, edge, end, self.side[k], self.at[k])
@@ -73,15 +74,25 @@ def _feature_table(count_a: int, count_b: int) -> _FeatureTable:
 
 
 def _sides_of(count_a: int, count_b: int) -> list[tuple[bool, int, int]]:
-    """Return whose corners are compared with the edges of the other one, and the numbers of corners of both."""
+    """Return the comparisons of the corners of one figure with the edges of the other one.
+
+    A comparison consists of True if the corners are those of A and False if they are those of B, the number of these corners, and
+    the number of corners of the other figure. A point has no edges; for two points there is one comparison.
+    """
     both = [(True, count_a, count_b), (False, count_b, count_a)]
     return [x for x in both if x[2] > 1] or both[:1]
 
 
 class _CornerPlaces(NamedTuple):
-    """Places of corners, from edges: to the left, along them from the start, and past the end (V, E, N).
+    """Distances of the corners of one figure from the edges of another one, and properties of these edges.
 
-    Of the edges (E, N): unit vectors, and how far they separate the figures.
+    Attributes:
+        left: the distance of each corner to the left of each edge (V, E, N).
+        along: the distance along the edge from its start.
+        past: the distance along the edge from its end.
+        ex: x of the unit vector of each edge (E, N).
+        ey: y of that vector.
+        apart: the distance by which the edge separates the figures (E, N), negative if it does not.
     """
 
     left: Any
@@ -153,7 +164,7 @@ def _joined(arrays: list[np.ndarray]) -> np.ndarray:
 
 
 def _first_least(rows: Float[np.ndarray, "R N"]) -> Int[np.ndarray, "N"]:
-    """Return the numbers of the rows that have the least numbers; `argmin` is slow if there are few rows."""
+    """Return the index of the first row with the least number in each column; `argmin` is slow if there are few rows."""
     if len(rows) > FEW_ROWS:
         return rows.argmin(0)
     least, found = rows[0], np.zeros(rows.shape[1], int)
@@ -164,9 +175,9 @@ def _first_least(rows: Float[np.ndarray, "R N"]) -> Int[np.ndarray, "N"]:
 
 
 def _ways_out(sides: list[tuple[np.ndarray, np.ndarray]]) -> tuple[Int[np.ndarray, "N"], Bool[np.ndarray, "N"]]:
-    """Return the pairs of a corner and an edge of the shortest ways out, and whether they lead to the right of the edge.
+    """Return the shortest ways out of overlapping figures: rows of `_feature_table`, and True if they lead to the edge's right.
 
-    Given are the places to the left of the edges, and the separations.
+    `sides` has `left` and `apart` of `_CornerPlaces` for each comparison of `_sides_of`.
     """
     found, first = [], 0
     for left, apart in sides:
@@ -183,9 +194,9 @@ def _ways_out(sides: list[tuple[np.ndarray, np.ndarray]]) -> tuple[Int[np.ndarra
 
 
 def gap_at(p: Any, start: Any, end: Any, side: Any, at: Any) -> tuple[Any, Any, Any]:
-    """Return the signed distance of a point p from an edge or its end, the unit vector to p, and the closest place (2, ...).
+    """Return the signed distance of a point p from an edge or one of its ends, the unit vector to p, and the closest point.
 
-    The distance is a smooth function of all places, also of JAX.
+    `side` and `at` are those of `Feature`. The distance is a smooth function of all points, which may be arrays of JAX.
     """
     xp = array_namespace(p, start, end)
     way, r = end - start, xp.where(at == 2, p - end, p - start)

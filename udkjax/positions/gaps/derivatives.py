@@ -1,9 +1,9 @@
-"""Derivatives of least gaps, in the pose to which the least gap moves.
+"""Derivatives of least gaps with respect to numbers p of the mechanism, by the equations of the pose with the least gap.
 
-That pose solves equations F(y, p) = 0 of the numbers p. With z = (q, s) and Psi(z) = 0, they are grad_z (g + lambda Psi) = 0 at a
-smooth minimum, g_1 = g_2 at a kink of two features, s = const at an end of the range, and Psi_q w = 0, |w| = 1 at a toggle. Two
-steps of Newton's method with one Jacobian give first and second derivatives of y; only that pose is differentiated, never the
-motion that leads to it.
+That pose solves equations F(y, p) = 0, where y consists of z = (q, s) and further unknowns. Besides Psi(z) = 0 the equations are,
+with g the gap: grad_z (g + lambda Psi) = 0 at a smooth minimum, g_1 = g_2 at a kink, where two features have the same gap,
+s = const at an end of the range, and Psi_q w = 0, |w| = 1 at a toggle. Two steps of Newton's method with one Jacobian give first
+and second derivatives of y; only that pose is differentiated, never the motion that leads to it.
 """
 
 from collections.abc import Sequence
@@ -30,7 +30,7 @@ CHORDS = 2  # with the Jacobian there: each makes one more order of the derivati
 
 
 class DrivenPoses(NamedTuple):
-    """Poses and rates of a driven mechanism, as functions of z = (q, s) in the units of a curve."""
+    """Poses and constraints of a driven mechanism as functions of z = (q, s) in the units of a curve; s is the driver's value."""
 
     curve: Curve
 
@@ -42,7 +42,7 @@ class DrivenPoses(NamedTuple):
 
 
 class RunPoses(NamedTuple):
-    """Poses and rates on the cubic between two output times of a run, as functions of z = (t,), from 0 to 1."""
+    """Poses on the cubic between two output times of a run as a function of z = (t,), with t from 0 to 1; no constraints."""
 
     ts: Float[Array, "2"]
     states: Float[Array, "2 2 bodies 3"]  # positions and velocities at both
@@ -61,7 +61,18 @@ PosesNear = DrivenPoses | RunPoses
 
 
 class ClosestPair(NamedTuple):
-    """The features at which two parts are closest: corner, start and end of an edge (features, 2), and how; the radii's sum."""
+    """The features at which two parts are closest: one, or two at a kink. All attributes but `bodies` and `radius` are stacked.
+
+    Attributes:
+        bodies: the indices of the bodies of both parts; the ground's is the last.
+        corner: a corner of one part in the frame of its body (m), (features, 2).
+        start: the start of an edge of the other part, in the frame of its body.
+        end: the end of that edge.
+        of_a: whether the corner belongs to the first part.
+        side: as in `Feature`.
+        at: as in `Feature`.
+        radius: the sum of the radii of both parts (m).
+    """
 
     bodies: Any
     corner: Array
@@ -73,7 +84,7 @@ class ClosestPair(NamedTuple):
     radius: Any
 
     def gap(self, q: Float[Array, "bodies 3"], k: int = 0) -> Array:
-        """Return the distance of feature k in a pose, the ground's last."""
+        """Return the gap (m) at feature k in the pose q, in which these features stay the closest ones."""
         poses = jnp.concatenate([q, jnp.zeros((1, 3))])[self.bodies]
         one, other = jnp.where(self.of_a[k], poses, poses[::-1])
         places = _placed(one, self.corner[k]), _placed(other, self.start[k]), _placed(other, self.end[k])
@@ -90,7 +101,18 @@ def differentiable_gaps(
     least: Sequence[Least],
     m: PolynomialMotion,
 ) -> list[Array]:
-    """Return least gaps with derivatives of first and second order with respect to every number."""
+    """Return the distances of least gaps (m) with first and second derivatives with respect to every traced number.
+
+    Args:
+        mechanism: the mechanism, with traced numbers.
+        driver: the driver or coordinate; not used with a `run`.
+        run: the run or `Kinematics`; None with a driver.
+        held: values that other drivers or coordinates hold, by name, or None.
+        parts: convex parts of the links, with traced numbers.
+        order: names of the bodies in the order of poses, with the ground last.
+        least: the least gaps that `search` has found for the concrete numbers.
+        m: the motion of the concrete numbers.
+    """
     curve = None if run is not None else Curve.of(drive(mechanism, driver, 0.0, held))
     found = []
     for x in least:
@@ -108,7 +130,16 @@ def differentiable_gaps(
 
 
 def _moved(kind: str, place: PosesNear, pair: ClosestPair, z: np.ndarray, v: np.ndarray, distance: float) -> Array:
-    """Return a least gap with its derivatives."""
+    """Return a least gap with its derivatives.
+
+    Args:
+        kind: "smooth", "kink", "end" or "toggle": the equations to solve.
+        place: poses and constraints as functions of z.
+        pair: the closest features.
+        z: the concrete solution, up to the errors of the motion's polynomials.
+        v: the derivatives of the pose by the motion's parameter (bodies, 3).
+        distance: the least gap (m) of the concrete numbers, which is the value of the result.
+    """
     given = without_derivatives((place, pair))
     more = np.zeros(given[0].psi(z).size if kind == "smooth" else 0)
     if kind == "toggle":
@@ -124,7 +155,15 @@ def _moved(kind: str, place: PosesNear, pair: ClosestPair, z: np.ndarray, v: np.
 
 
 def _equations(kind: str, place: PosesNear, pair: ClosestPair, fixed: tuple[Any, Any], y: Any) -> Array:
-    """Return F, which is zero in the pose y of the least gap."""
+    """Return F(y), which is zero in the pose of the least gap.
+
+    Args:
+        kind: "smooth", "kink", "end" or "toggle".
+        place: poses and constraints as functions of z.
+        pair: the closest features.
+        fixed: z at the start, and at a toggle a unit vector that normalizes w.
+        y: z, followed by lambda at a smooth minimum and by w at a toggle.
+    """
     start, more = fixed
     z, extra = y[: len(start)], y[len(start) :]
     psi = place.psi(z)

@@ -59,11 +59,11 @@ class LeastGap(NamedTuple):
 
     Attributes:
         pair: the names of the links.
-        value: the value of the driver (rad, m) or the time (s) at which it is least.
-        distance: the gap (m); negative if the links overlap, by the way on which they come apart soonest.
-        bound: the gap (m) below which none is, between samples either.
-        points: the closest points of the outlines (m), the first on the first link.
-        q: the pose (bodies, 3) in which it is least (m, m, rad).
+        value: the value of the driver (rad, m) or the time (s) at which the gap is least.
+        distance: the gap (m); if the links overlap, minus the length of the shortest translation that separates them.
+        bound: a proven lower bound of the gap (m) over the whole motion, including the intervals between samples.
+        points: the closest points of the outlines in ground axes (m), the first on the first link.
+        q: the pose of all bodies at which the gap is least (m, m, rad).
     """
 
     pair: LinkPair
@@ -82,8 +82,9 @@ class Touch(NamedTuple):
 
     Attributes:
         pair: the names of the links.
-        begins: the value of the driver (rad, m) or the time (s) at which it begins; the first one if they touch from there.
-        ceases: the value at which it ceases; the last one if they still touch.
+        begins: the value of the driver (rad, m) or the time (s) at which the links begin to touch; the first value of the motion
+            if they touch from the start.
+        ceases: the value at which they cease to touch; the last value of the motion if they touch to the end.
     """
 
     pair: LinkPair
@@ -97,11 +98,11 @@ class LeastGaps(PrintsTable):
     Attributes:
         pairs: the least gap of each pair, the smallest first.
         contacts: the stretches over which pairs touch, in the order of values.
-        unit: of the values.
-        missing: the share of the range that is not reached, or in which a run has failed: nothing is known there.
+        unit: the unit of the values: "rad", "m" or "s".
+        missing: the fraction of the range that is not reached, or in which a run has failed: nothing is known there.
         count: the zero and the units in which values and lengths are shown; None: SI units.
-        parts: the convex outlines between which gaps are measured: of each, the name of its link, its corners in the frame of the
-            link (m), and a radius around them (m).
+        parts: the convex outlines between which gaps are measured, each with the name of its link, its corners in the frame of
+            the link (m), and a radius around them (m).
     """
 
     pairs: tuple[LeastGap, ...]
@@ -117,22 +118,26 @@ class LeastGaps(PrintsTable):
         return self.pairs[0]
 
     def rows(self) -> list[tuple[str, str, str]]:
-        """Return the links of each pair, their least gap, and the value at which it is least, as texts in the drawing's units."""
+        """Return for each pair its links, their least gap and the value at which it is least, as texts in the drawing's units."""
         size = max(float(np.max(np.abs(np.asarray(gap.points)))) for gap in self.pairs)
         return [(" and ".join(x.pair), self._length(x.distance, size), self._value(x.value)) for x in self.pairs]
 
     def summary(self) -> str:
-        """Return in words, in the drawing's units, which links come closest, or overlap most."""
+        """Return a phrase, in the drawing's units, with the smallest gap or the largest overlap and the names of its links."""
         (pair, gap, _), overlaps = self.rows()[0], float(self.least.distance) < 0
         return f"{pair} overlap by {gap.removeprefix('-')}" if overlaps else f"least gap of {pair}: {gap}"
 
     def remarks(self) -> list[str]:
-        """Return sentences, in the drawing's units, on where links touch and on how much of the range is not reached."""
+        """Return a sentence for each stretch in which links touch, and one for a part of the range that is not reached."""
         says = [f"{' and '.join(x.pair)} touch from {self._value(x.begins)} to {self._value(x.ceases)}" for x in self.contacts]
         return says + ([f"{100 * self.missing:.3g} % of the range is not reached"] if self.missing else [])
 
     def touching(self, frames: Mapping[str, Float[np.ndarray, "3"]]) -> list[int]:
-        """Return the indices of the `parts` of links that touch, by the frames x, y, angle (m, m, rad) of links; others rest."""
+        """Return the indices of all `parts` of the pairs of links that touch or overlap in a pose.
+
+        Args:
+            frames: x, y (m) and angle (rad) of links by name; a link without a frame, such as the ground, is at the origin.
+        """
         places = [corners[..., None] for corners in self.corners_in(frames)]
 
         def touch(i: int, j: int) -> bool:
@@ -142,7 +147,7 @@ class LeastGaps(PrintsTable):
         return sorted({k for one, other in pairs if any(touch(i, j) for i in one for j in other) for k in (*one, *other)})
 
     def corners_in(self, frames: Mapping[str, Any]) -> list[Float[np.ndarray, "corners 2"]]:
-        """Return the corners (m) of each of the `parts`, moved from their own frames to x, y, angle of links; others stay."""
+        """Return the corners (m) of each of the `parts` in ground axes, in the pose given by `frames` as for `touching`."""
         moved = []
         for part in self.parts:
             x, y, angle = map(float, frames.get(part.body, (0.0, 0.0, 0.0)))
@@ -152,7 +157,7 @@ class LeastGaps(PrintsTable):
 
     @property
     def parts_of_pairs(self) -> list[tuple[list[int], list[int]]]:
-        """The indices of the `parts` of both links of each pair."""
+        """The indices of the `parts` of the first and of the second link of each pair."""
         of = {name: [k for k, part in enumerate(self.parts) if part.body == name] for gap in self.pairs for name in gap.pair}
         return [(of[one], of[other]) for one, other in (gap.pair for gap in self.pairs)]
 
@@ -184,11 +189,11 @@ def gaps(
 ) -> LeastGaps:
     """Return the least gap of each pair of links over a motion, proven between samples.
 
-    The signed distance of two convex outlines is max over n of min n . (b - a), with n from the first to the second. From the
-    speeds and accelerations of the outlines follows how far it can fall between two samples; where it could fall below the least
-    gap, more positions are computed. `bound` is what is proven, as a rule to 1e-9 of the mechanism's size. Between samples of a
-    drive, positions are polynomials of degree five, compared with computed ones halfway; between output times of a run, they are
-    the cubics through its positions and velocities.
+    The signed distance of two convex outlines is the maximum over unit vectors n of min n . (b - a), with a and b points of the
+    first and of the second outline. Speeds and accelerations of the outlines limit how far it can fall between two samples; where
+    it could fall below the least gap found, more positions are computed. `bound` is the proven lower bound of the gap, as a rule
+    within 1e-9 of the mechanism's size. Between samples of a drive, positions are polynomials of degree five, compared with
+    computed ones halfway; between output times of a run, they are the cubics through its positions and velocities.
 
     Links are drawn bars with round ends (`width`), discs, plates and outlines, and cams (for a roller, the path of its centre).
     Outlines that are not convex are cut into convex parts; an overlap of links is the largest one of their parts.
@@ -201,15 +206,15 @@ def gaps(
         drive: a driver or coordinate, as for `kinematics`; by default the only driver.
         layers: the layer of each link; all pairs of a layer are measured. By default all pairs that share no joint or pin.
         pairs: pairs of names of links, instead of layers.
-        values: values of the driver (rad, m) between whose least and largest it moves; by default one turn, or from toggle to
-            toggle.
+        values: values of the driver (rad, m), which moves from the least to the largest of them; by default one turn, or from
+            toggle to toggle.
         run: a `Solution` or `Kinematics`, instead of a driver.
         shapes: outlines by link or "ground", instead of the drawn ones: a width (m) around the pins, corners (n, 2) in the frame
             of the link (m), or a tuple of corners and a width around them.
         held: values that other drivers or coordinates hold, by name, as for `kinematics`.
 
     Returns:
-        `LeastGaps`, which print as a table.
+        A `LeastGaps`, which prints as a table.
 
     Raises:
         SceneError: a link has no outline, a name is unknown, links of one layer share a joint, or positions do not follow from

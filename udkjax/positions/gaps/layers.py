@@ -1,4 +1,4 @@
-"""`layers`: the fewest layers in which links pass each other."""
+"""`layers`: the fewest layers (parallel planes) in which the links of a mechanism move without hitting each other."""
 
 from collections.abc import Mapping, Sequence
 from itertools import combinations
@@ -27,8 +27,8 @@ class Layers(PrintsTable):
 
     Attributes:
         of: the layer of each link, from 0.
-        conflicts: the pairs of links that cannot be in one layer, as they share a joint or hit each other.
-        is_least: whether it is known that fewer layers are not enough.
+        conflicts: the pairs of links that cannot be in one layer, because they share a joint or hit each other.
+        is_least: whether it is proven that no smaller number of layers is possible.
     """
 
     of: dict[str, int] = eqx.field(static=True)
@@ -58,18 +58,18 @@ def layers(
     """Return the fewest layers of links in which nothing hits anything over a motion.
 
     Links that share a joint are in different layers, and so are links that touch anywhere in the motion (`gaps`): the layers are
-    the colours of the graph of these conflicts. Up to 20 links their number is the least, by branch and bound; with more, links
-    of most conflicts choose first (DSATUR).
+    the colours of the graph of these conflicts. Up to 20 links, branch and bound finds the smallest number of layers; for more
+    links, a greedy colouring (DSATUR) finds a number that may not be the smallest.
 
     Args:
         mechanism: the mechanism; its numbers are not traced.
         drive: a driver or coordinate, as for `gaps`.
-        values: values of the driver that its range shall contain.
-        run: a run instead of a driver.
+        values: values of the driver (rad, m), which moves from the least to the largest of them, as for `gaps`.
+        run: a `Solution` or `Kinematics`, instead of a driver.
         shapes: outlines by link or "ground", as for `gaps`.
 
     Returns:
-        `Layers`: `gaps(..., layers=found.of)` finds no contact.
+        A `Layers`; with its attribute `of` as the argument `layers`, `gaps` finds no contact.
 
     Raises:
         SceneError: as `gaps`.
@@ -90,7 +90,10 @@ def layers(
 
 
 def colouring(edges: Bool[np.ndarray, "n n"], exact: bool = True) -> list[int]:
-    """Return colours of the nodes of a graph such that no edge has one colour at both ends: the fewest, or by DSATUR.
+    """Return a colour, from 0, of each node of a graph such that the nodes of an edge have different colours.
+
+    If `exact`, the number of colours is the smallest possible one; otherwise it is the one that DSATUR finds. `edges` is
+    symmetric.
 
     Source: D. Brelaz, New methods to color the vertices of a graph, Communications of the ACM 22 (1979).
     """
@@ -98,7 +101,7 @@ def colouring(edges: Bool[np.ndarray, "n n"], exact: bool = True) -> list[int]:
     neighbours, best = [np.flatnonzero(row).tolist() for row in edges], list(range(n))
 
     def extend(colours: list[int], used: int) -> bool:
-        """Colour one more node; return True to stop."""
+        """Colour the remaining nodes, of which `colours` is -1, and note a better colouring in `best`; return True to stop."""
         nonlocal best
         if used >= 1 + max(best):
             return False

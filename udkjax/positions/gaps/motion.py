@@ -1,7 +1,8 @@
-"""Motions of bodies as polynomials between poses, in the form of Bezier, whose control points bound their derivatives.
+"""Motions of bodies as polynomials between poses, in Bezier form: their control points bound their derivatives.
 
-The parameter u of a motion is the value of the driver; where the driver's range ends at toggles, the angle of
-s = lower + (upper - lower) (1 - cos u) / 2, of which positions are smooth functions there; for a run, time.
+The parameter u of a motion driven by a driver is the driver's value s; but if the driver's range ends at toggles, u is the angle
+in s = lower + (upper - lower) (1 - cos u) / 2, because positions at a toggle are smooth functions of u, not of s. The parameter
+of a run is time.
 """
 
 from collections.abc import Callable
@@ -26,14 +27,14 @@ PosesAndRates = Float[np.ndarray, "n 3 bodies 3"]  # positions of bodies and, la
 
 
 class PolynomialMotion(NamedTuple):
-    """A motion.
+    """A motion of bodies, with one polynomial of their poses in each interval (piece) of a parameter u.
 
     Attributes:
-        u: the parameters at which its polynomials meet.
-        points: their control points; NaN where nothing is known.
+        u: the parameters at which the polynomials meet.
+        points: the control points of x, y (m) and angle (rad) of each body, with the ground last; NaN where nothing is known.
         known: mask of the intervals with a polynomial: those of positive length with finite control points.
-        unit: unit of its values.
-        value: the value of the driver (rad, m) or the time (s) at parameters.
+        unit: the unit of the driver's values, or "s" for a run.
+        value: a function that returns the values of the driver (rad, m) or the times (s) at parameters u.
         toggles: whether the range ends at toggles.
     """
 
@@ -46,23 +47,29 @@ class PolynomialMotion(NamedTuple):
 
     @classmethod
     def of(cls, u: Float[np.ndarray, "n"], points: np.ndarray, unit: str) -> "PolynomialMotion":
-        """Return the motion with these control points."""
+        """Return the motion with these control points, whose parameter is the driver's value or time."""
         return cls(u, points, np.isfinite(points.reshape(-1, len(u) - 1).sum(0)) & (np.diff(u) > 0), unit)
 
     @property
     def missing(self) -> float:
-        """Fraction of the range without polynomials."""
+        """The fraction of the range of u without polynomials."""
         return max(0.0, 1.0 - float(np.diff(self.u)[self.known].sum() / (self.u[-1] - self.u[0])))
 
     def at(self, u: Any, piece: Int[np.ndarray, "n"]) -> tuple[np.ndarray, np.ndarray]:
-        """Return the poses (n, bodies, 3) in pieces, and their derivatives by u."""
+        """Return the poses (n, bodies, 3) at parameters u in the given pieces, and their derivatives by u."""
         h = np.diff(self.u)[piece]
         q, v = de_casteljau(self.points[..., piece], (u - self.u[piece]) / h, h)
         return q.T, v.T
 
 
 def de_casteljau(stage: Any, t: Any, h: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Return the values of polynomials with these control points (degree+1, ...) at shares t of intervals h, and their slopes."""
+    """Return the values and the slopes of polynomials in Bezier form.
+
+    Args:
+        stage: their control points (degree+1, ...).
+        t: the places, as fractions of the intervals, from 0 to 1.
+        h: the lengths of the intervals.
+    """
     degree = len(stage) - 1
     while len(stage) > 2:
         stage = stage[:-1] + t * (stage[1:] - stage[:-1])
@@ -84,7 +91,10 @@ def motion_of_run(run: StateHistory) -> PolynomialMotion:
 
 
 def motion_of_drive(mechanism: Mechanism, driver: str | Coordinate, values: Any, held: Any) -> PolynomialMotion:
-    """Return the motion over the range of a driver, or between the least and the largest of given values."""
+    """Return the motion of a driven mechanism from the least to the largest of `values`; None: one turn, or between toggles.
+
+    Raises a `SceneError` if `values` is None and an end of the driver's range is not known.
+    """
     sample = partial(_poses, mechanism, driver, held)
     if values is None:
         limits = travel(mechanism, driver, None, held)
@@ -128,7 +138,14 @@ def _between_toggles(
 def _follow(
     sample: Callable[[Any], PosesAndRates], u: Float[np.ndarray, "n"], unit: str, toggles: Any = None
 ) -> PolynomialMotion:
-    """Return the motion through poses at parameters, and between them, until its polynomials describe it."""
+    """Return the motion through sampled poses; intervals are halved until the polynomials agree with samples halfway.
+
+    Args:
+        sample: a function that returns poses and two derivatives by u at parameters.
+        u: the first parameters.
+        unit: the unit of the driver's values.
+        toggles: the poses (2, bodies, 3) at both ends, if these are toggles, where derivatives cannot be sampled; otherwise None.
+    """
     x = sample(u if toggles is None else u[1:-1])
     if toggles is not None:
         x = np.concatenate([np.zeros_like(x[:1]), x, np.zeros_like(x[:1])])
@@ -154,14 +171,17 @@ def _follow(
 
 
 def _control_points(h: Any, one: PosesAndRates, other: PosesAndRates) -> Float[np.ndarray, "6 3 bodies pieces"]:
-    """Return the control points of polynomials of degree five by positions and two derivatives at both ends."""
+    """Return the control points of polynomials of degree five, from positions and two derivatives at both ends of intervals h."""
     (q0, v0, a0), (q1, v1, a1) = (x.transpose(1, 3, 2, 0) for x in (one, other))
     b1, b4 = q0 + h * v0 / 5, q1 - h * v1 / 5
     return np.stack([q0, b1, 2 * b1 - q0 + h * h * a0 / 20, 2 * b4 - q1 + h * h * a1 / 20, b4, q1])
 
 
 def _toggle(h: float, near: Float[np.ndarray, "3 bodies 3"], q: Float[np.ndarray, "bodies 3"]) -> np.ndarray:
-    """Return the pose at a toggle: its derivatives are those of the cubic through it and the next pose, h away."""
+    """Return the pose q at a toggle with two derivatives: those of the cubic through q and, at the distance h, the sample `near`.
+
+    `near` has the next pose and its two derivatives. Angles of q are shifted by whole turns towards it.
+    """
     place = q.copy()
     place[:, 2] += 2 * np.pi * np.round((near[0, :, 2] - place[:, 2]) / (2 * np.pi))
     # near = place + h c1 + h^2 c2 + h^3 c3, and its two derivatives

@@ -9,18 +9,19 @@ ORDERS = 4  # of derivatives
 
 
 class MotionTables:
-    """A motion at places s = piece + t, with t from 0 to 1 within each piece.
+    """A motion at places s = piece + t, with t from 0 to 1 within each piece; node k is the place s = k.
 
     The last axis of tables has piece p of body b at b * pieces + p.
 
     Attributes:
-        starts: the first node of each chain of known pieces.
-        ends: the last node of each.
-        piece_at: of each node, the known piece that starts there, or the one that ends there.
-        places: bounds of the derivatives by u of the origins of bodies, from the first one; 0 where nothing is known.
-        directions: bounds of the derivatives of unit vectors that turn with bodies.
+        starts: the first node of each chain of known pieces that follow each other.
+        ends: the last node of each chain.
+        piece_at: for each node, the index of the known piece that starts there, or else of the one that ends there.
+        places: bounds over each piece of the first to fourth derivatives by u of the origin of each body; 0 where nothing is
+            known.
+        directions: the same bounds for a unit vector that turns with the body.
         lowest: the least coordinates of the origins of bodies at nodes (2, bodies).
-        highest: the largest ones.
+        highest: the largest coordinates of the origins at nodes (2, bodies).
     """
 
     starts: Int[np.ndarray, "chains"]
@@ -51,7 +52,10 @@ class MotionTables:
         self._over = {1: np.stack([self.places[:2], self.directions[:2]])}
 
     def over(self, count: int) -> Float[np.ndarray, "2 2 pieces"]:
-        """Return the largest first and second derivatives of `places` and `directions` over so many pieces: a power of two."""
+        """Return bounds of first and second derivatives over `count` pieces, a power of two, beginning with each piece.
+
+        The first axis is that of `places` and `directions`, the second that of the order.
+        """
         if count not in self._over:
             half = self.over(count // 2).reshape(2, 2, -1, self.pieces)
             found = half.copy()
@@ -60,18 +64,18 @@ class MotionTables:
         return self._over[count]
 
     def parameters(self, s: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
-        """Return the parameters u at places."""
+        """Return the parameters u at places s."""
         piece = self.piece_at[s.astype(int)]
         return self.motion.u[piece] + (s - piece) * self.steps[piece]
 
     def poses(self, body: Int[np.ndarray, "n"], s: Float[np.ndarray, "n"]) -> tuple[np.ndarray, np.ndarray]:
-        """Return the poses (3, n) of bodies at places, and their derivatives by u."""
+        """Return the poses (3, n) of n bodies, each at its place s, and their derivatives by u."""
         piece = self.piece_at[s.astype(int)]
         return de_casteljau(self.controls.take(body * self.pieces + piece, -1), s - piece, self.steps[piece])
 
 
 def turning(of_angles: Float[np.ndarray, "orders ..."]) -> Float[np.ndarray, "orders ..."]:
-    """Return bounds of the derivatives of a unit vector by those of its angle: complete Bell polynomials."""
+    """Return bounds of the derivatives of a unit vector from those of its angle, by complete Bell polynomials."""
     a, b, c, d = of_angles
     square = a * a
     return np.stack([a, b + square, c + a * (3 * b + square), d + 4 * a * c + 3 * b * b + square * (6 * b + square)])

@@ -17,7 +17,7 @@ SAME_PIN = 1e-9  # of the largest coordinate of a pin: two revolutes of a body n
 
 
 def joined_pairs(mechanism: Mechanism) -> dict[LinkPair, str]:
-    """Return the pairs of links that share a joint or a pin, each with the joint's name; numbers are concrete.
+    """Return the name of a joint by each pair of links that share this joint or a pin, in both orders; numbers are concrete.
 
     Two revolutes at the same place of a third link, or of the ground, are one pin of all their links.
     """
@@ -46,7 +46,10 @@ def pairs_to_check(
     pairs: Sequence[Sequence[str]] | None,
     shapes: Mapping[str, Any] | None,
 ) -> list[LinkPair]:
-    """Return the pairs of links whose gaps are asked for; raise a `SceneError` that names unknown links and layers that clash."""
+    """Return the pairs of links that the arguments `layers`, `pairs` and `shapes` of `gaps` select.
+
+    Raises a `SceneError` that names unknown links, and links of one layer that share a joint.
+    """
     names = [*mechanism.body_names, *([GROUND] if GROUND in (shapes or {}) else [])]
     if pairs is not None:
         _require(mechanism, _mistakes_in_pairs(mechanism, pairs, layers, shapes))

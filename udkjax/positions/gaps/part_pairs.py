@@ -1,4 +1,4 @@
-"""Pairs of convex parts of links in poses: their gaps, where they are closest, and how fast the gaps change."""
+"""Pairs of convex parts of links in poses: their gaps, their closest points and features, and the rates of the gaps."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -20,15 +20,15 @@ class PlacedFrames(NamedTuple):
 
     @classmethod
     def of(cls, q: Float[np.ndarray, "3 n"]) -> "PlacedFrames":
-        """Return the frames of poses."""
+        """Return the frames of n bodies in the poses q: x, y (m) and angle (rad)."""
         return cls(q[0], q[1], np.cos(q[2]), np.sin(q[2]))
 
     def take(self, k: Int[np.ndarray, "n"]) -> "PlacedFrames":
-        """Return the frames k."""
+        """Return the frames with the indices k."""
         return PlacedFrames(*(x.take(k) for x in self))
 
     def place(self, corners: Corners) -> Corners:
-        """Return corners that are given in the frames."""
+        """Return corners in ground axes, from the corners (V, 2, n) in these frames."""
         a, b = corners[:, 0], corners[:, 1]
         placed = np.empty_like(corners)
         np.subtract(self.cos * a, self.sin * b, out=placed[:, 0])
@@ -39,7 +39,15 @@ class PlacedFrames(NamedTuple):
 
 
 class ClosestPlaces(NamedTuple):
-    """Gaps of parts (n), their closest features and places (2, 2, n), directions n from A to B (2, n), and rates of gaps (n)."""
+    """The closest places of n pairs of parts A and B.
+
+    Attributes:
+        gap: the gaps (m), (n,).
+        features: the closest features.
+        places: the closest points of the hulls of the corners, without radii, in ground axes (m): (part, xy, n).
+        n: unit vectors from A to B, (2, n).
+        rate: derivatives of the gaps by the parameter of the motion, (n,).
+    """
 
     gap: np.ndarray
     features: Feature
@@ -49,7 +57,7 @@ class ClosestPlaces(NamedTuple):
 
     @property
     def arrays(self) -> list[np.ndarray]:
-        """All of its arrays, those of features as well."""
+        """A list of all arrays, with those of `features`."""
         return [self.gap, *self.features, self.places, self.n, self.rate]
 
     def take(self, k: slice) -> "ClosestPlaces":
@@ -61,12 +69,12 @@ class PartPairs(NamedTuple):
     """Pairs of convex parts with the same numbers of corners.
 
     Attributes:
-        owner: the pair of links of each.
-        parts: numbers of both parts.
-        bodies: numbers of their bodies.
-        A: corners of the first ones.
-        B: corners of the second ones.
-        radii: the radii around them (m).
+        owner: the index of the pair of links to which each pair of parts belongs.
+        parts: the indices of both parts in the list of all parts.
+        bodies: the indices of the bodies of both parts.
+        A: corners of the first parts, in the frames of their bodies (m).
+        B: corners of the second parts.
+        radii: the radii around both parts (m).
     """
 
     owner: Int[np.ndarray, "n"]
@@ -83,25 +91,25 @@ class PartPairs(NamedTuple):
 
     @property
     def counts(self) -> tuple[int, int]:
-        """The numbers of corners of the first ones and of the second ones."""
+        """The number of corners of each first part, and of each second part."""
         return len(self.A), len(self.B)
 
     @property
     def reach(self) -> Float[np.ndarray, "2 n"]:
-        """The largest distances of corners from the origins of their bodies."""
+        """The largest distance of a corner of each part from the origin of its body (m)."""
         return np.stack([np.sqrt((x * x).sum(1).max(0)) for x in (self.A, self.B)])
 
     def placed(self, k: Int[np.ndarray, "n"], frames: Sequence[PlacedFrames]) -> tuple[Corners, Corners]:
-        """Return the corners of the pairs k in the frames of both bodies."""
+        """Return the corners of both parts of the pairs k in ground axes, with their bodies in the given frames."""
         return frames[0].place(self.A.take(k, -1)), frames[1].place(self.B.take(k, -1))
 
     def closest(self, k: Int[np.ndarray, "n"], frames: Sequence[PlacedFrames]) -> tuple[tuple[Corners, Corners], Closest]:
-        """Return the corners of the pairs k in the frames of both bodies, and how they are closest: without the radii."""
+        """Return the corners of the pairs k as `placed` does, and their `Closest`, whose distances ignore the radii."""
         corners = self.placed(k, frames)
         return corners, closest(*corners)
 
     def closest_places(self, k: Int[np.ndarray, "n"], poses: Sequence[tuple[np.ndarray, np.ndarray]]) -> ClosestPlaces:
-        """Return the closest places of the pairs k in poses (3, n) of both bodies, given with their rates."""
+        """Return the closest places of the pairs k, from the poses (3, n) of both bodies and their derivatives (3, n)."""
         corners, near = self.closest(k, [PlacedFrames.of(q) for q, _ in poses])
         found, every = near.features(self.counts, slice(None)), np.arange(len(k))
         A, B = (x[np.minimum(found.corner, len(x) - 1), :, every].T for x in corners)
@@ -115,7 +123,13 @@ class PartPairs(NamedTuple):
 
 
 def part_pairs(parts: Sequence[ConvexPart], order: Sequence[str], pairs: Sequence[tuple[str, str]]) -> list[PartPairs]:
-    """Return the pairs of parts of pairs of links, one group for each two numbers of corners."""
+    """Return all pairs of parts of the given pairs of links, grouped by the numbers of corners of both parts.
+
+    Args:
+        parts: the parts of all links.
+        order: names of the bodies, by their indices.
+        pairs: the names of the links of each pair.
+    """
     groups: dict[tuple[int, int], list[tuple[int, int, int]]] = {}
     corners, of_body = [np.asarray(part.corners, float) for part in parts], {}
     for k, part in enumerate(parts):

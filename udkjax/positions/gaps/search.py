@@ -1,9 +1,10 @@
 """The least gaps of pairs of parts over a motion, proven between its poses, and where pairs begin and cease to touch.
 
-With L the length of the ways of both parts over an interval, d >= (d0 + d1 - L) / 2. With n the direction in which the gap at one
-end is measured, d >= min n.(b - a) over all points of the parts, of which each is above its chord minus M h^2 / 8, with M the
-sum of the largest accelerations. Within a polynomial of the motion, `bounds` has narrower ones. Intervals in which a gap could be
-below the least one found are split.
+Let d0 and d1 be the gaps at both ends of an interval of length h, and L the sum of the lengths of the paths of both parts. Then a
+gap d within the interval is at least (d0 + d1 - L) / 2. With n the direction of the gap at one end, d >= min n.(b - a) over all
+points of the parts; each of these products is above its chord minus M h^2 / 8, with M the sum of the largest accelerations.
+Within a polynomial of the motion, `bounds` has narrower bounds. Intervals in which a gap could be below the least one found are
+split.
 """
 
 from collections.abc import Callable, Sequence
@@ -34,9 +35,16 @@ Stretches = list[tuple[float, float]]
 
 
 class Least(NamedTuple):
-    """The least gap of a pair of links: parameter, piece, distance (m), proven bound (m), parts, places and features.
+    """The least gap of a pair of links.
 
-    Where the gap has a kink, at which one feature closes and another opens, `features` are both.
+    Attributes:
+        u: the parameter of the motion at which the gap is least.
+        piece: the index of the polynomial of the motion at u.
+        distance: the gap (m).
+        bound: a proven lower bound of the gap over the motion (m).
+        parts: the indices of the closest part of each link.
+        places: the closest points of both outlines (m), the first on the first link.
+        features: the closest features; two at a kink, where the gap of one feature falls and that of another one rises.
     """
 
     u: float
@@ -52,11 +60,11 @@ class Least(NamedTuple):
 def search(
     parts: Sequence[ConvexPart], order: Sequence[str], pairs: Sequence[tuple[str, str]], motion: PolynomialMotion
 ) -> tuple[list[Least], list[Stretches]]:
-    """Return the least gap of each pair of links, and the stretches of u over which it touches.
+    """Return the least gap of each pair of links, and the intervals of u over which the links of each pair touch.
 
     Args:
         parts: convex parts of links with concrete numbers.
-        order: names of the bodies, in the order of poses.
+        order: names of the bodies in the order of their poses, with the ground last.
         pairs: the pairs of links.
         motion: the motion.
     """
@@ -77,7 +85,10 @@ def search(
 
 
 class Intervals(NamedTuple):
-    """Intervals of pairs k from places s0 to s1, with the gaps there, and lower bounds of those between."""
+    """Intervals of a motion: each belongs to a pair of parts k and is from place s0, with the gap d0, to s1, with the gap d1.
+
+    `low` is a lower bound of the gap within the interval.
+    """
 
     k: Int[np.ndarray, "n"]
     s0: Float[np.ndarray, "n"]
@@ -88,12 +99,16 @@ class Intervals(NamedTuple):
 
     @classmethod
     def joined(cls, intervals: "Sequence[Intervals]") -> "Intervals":
-        """Return all of several."""
+        """Return the intervals of several `Intervals` as one."""
         return cls(*(np.concatenate(x) for x in zip(*intervals, strict=True)))
 
 
 class PairSearch:
-    """The gaps of pairs of parts of the same numbers of corners along a motion."""
+    """A search for the least gaps and the contacts of pairs of parts along a motion; places s are those of `MotionTables`.
+
+    For each pair of parts, `least` is the least gap found, `s` its place, `step` the length of the intervals around it, and `low`
+    a lower bound of its gaps over the motion.
+    """
 
     def __init__(self, pairs: PartPairs, motion: MotionTables):
         self.pairs, self.motion, self.reach, self.radius = pairs, motion, pairs.reach, pairs.radius
@@ -107,7 +122,7 @@ class PairSearch:
         self.touching_at_ends: list[np.ndarray] = []  # pairs that touch at the starts and at the ends of chains (pairs, chains)
 
     def closest_places(self, k: np.ndarray, s: np.ndarray) -> ClosestPlaces:
-        """Return the closest places of pairs k at places s of the motion."""
+        """Return the closest places of the pairs of parts k at places s of the motion."""
         return self.pairs.closest_places(k, [self.motion.poses(bodies[k], s) for bodies in self.pairs.bodies])
 
     def _gaps(self, k: np.ndarray, s: np.ndarray) -> Float[np.ndarray, "n"]:
@@ -117,7 +132,11 @@ class PairSearch:
         return [PlacedFrames.of(self.motion.poses(bodies[k], s)[0]) for bodies in self.pairs.bodies]
 
     def run(self, least: Float[np.ndarray, "owners"]) -> None:
-        """Split intervals until no gap can be below the least found, which is updated, and no touch is hidden within one."""
+        """Split intervals until no gap within one can be below the least found and no contact can be hidden in one.
+
+        Args:
+            least: the least gap found of each pair of links, which is updated in place.
+        """
         left, step = self._first_intervals(least), float(BLOCK)
         while 0 < len(left.k) <= MOST_INTERVALS:
             step /= SPLITS
@@ -134,7 +153,7 @@ class PairSearch:
         self._finish(left)
 
     def _first_intervals(self, least: Float[np.ndarray, "owners"]) -> Intervals:
-        """Return the blocks of pieces in which gaps can be below the least found."""
+        """Evaluate intervals of `BLOCK` pieces, and return those that must be split; set `touching_at_ends`."""
         motion, count = self.motion, len(self.least)
         blocks = [np.append(np.arange(*ends, BLOCK), ends[1]) for ends in zip(motion.starts, motion.ends, strict=True)]
         s, last = np.concatenate(blocks).astype(float), np.cumsum([len(x) for x in blocks]) - 1
@@ -157,15 +176,15 @@ class PairSearch:
     def _open(
         self, k: np.ndarray, s: np.ndarray, frames: list[PlacedFrames], inside: np.ndarray, step: float, least: np.ndarray
     ) -> tuple[Intervals, Float[np.ndarray, "n"]]:
-        """Return the intervals between neighbouring places of a pair that must be split, and the gaps at all places.
+        """Return the intervals between neighbouring places that must be split, and the gaps at all places; finish the others.
 
         Args:
-            k: pairs, in order.
+            k: the pair of parts of each place, in increasing order.
             s: places.
-            frames: frames of both bodies there.
-            inside: whether an interval is between each place and the next one.
+            frames: frames of both bodies at these places.
+            inside: True where a place and the next one are the ends of an interval.
             step: the largest length of the intervals.
-            least: the least gaps of pairs of links, which are updated.
+            least: the least gap found of each pair of links, which is updated in place.
         """
         corners, near = self.pairs.closest(k, frames)
         radius = self.radius[k]
@@ -193,7 +212,7 @@ class PairSearch:
         self, k: np.ndarray, s: np.ndarray, d: np.ndarray, corners: tuple[Corners, Corners], n: np.ndarray, radius: np.ndarray,
         step: float,
     ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-        """Return bounds of gaps between neighbouring places, below and above, by lengths of ways and directions at the ends."""
+        """Return lower and upper bounds of gaps between neighbouring places, by lengths of paths and directions at the ends."""
         u = self.motion.parameters(s)
         h, piece, (speed, acceleration) = u[1:] - u[:-1], self.motion.piece_at[s[:-1].astype(int)], np.zeros((2, len(k) - 1))
         largest, k = self.motion.over(max(1, int(step))), k[:-1]
@@ -211,7 +230,7 @@ class PairSearch:
     def _bounds_by_features(
         self, k: np.ndarray, s: np.ndarray, i: np.ndarray, corners: tuple[Corners, Corners], near: Closest
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return bounds of distances from the places i to the next ones, as the closest features turn, and where they are."""
+        """Return the results of `bounds_by_features` for the intervals from places i to i + 1: lower bounds, and fractions."""
         ends, u = np.stack([i, i + 1]), self.motion.parameters(s)
         piece, parts = s[i].astype(int), []
         for bodies, places, reach in zip(self.pairs.bodies, corners, self.reach, strict=True):
@@ -226,14 +245,17 @@ class PairSearch:
     def _is_open(
         self, k: np.ndarray, low: np.ndarray, high: np.ndarray, d0: np.ndarray, d1: np.ndarray, least: np.ndarray
     ) -> Bool[np.ndarray, "n"]:
-        """Return True for intervals in which a gap may be below the least one, or may change its sign unseen."""
+        """Return a mask of the intervals in which a gap may be below the least one, or a change of its sign is not isolated."""
         slack, opened = PROVEN * self.size, OPENED * self.size
         hides = ((low < -slack) & (np.minimum(d0, d1) > 0)) | ((high > opened) & (np.maximum(d0, d1) < 0))
         crosses = ((d0 < 0) != (d1 < 0)) & (high - low > opened)
         return (low < least[self.pairs.owner[k]] - slack) | hides | crosses
 
     def _note(self, k: np.ndarray, s: np.ndarray, d: np.ndarray, step: float, least: np.ndarray) -> None:
-        """Keep the least gaps so far, the first of equal ones, with their places and the length of the intervals around them."""
+        """Update the least gaps of the pairs of parts k by gaps d at places s; `step` is the length of the intervals around s.
+
+        Of equal gaps the first one is kept. `least`, of the pairs of links, is updated, too.
+        """
         begins = np.flatnonzero(np.append(True, k[1:] != k[:-1]))
         equal = np.minimum.reduceat(d, begins) + self.rounding
         at = np.flatnonzero(d <= np.repeat(equal, np.diff(np.append(begins, len(k)))))
@@ -245,7 +267,10 @@ class PairSearch:
         np.minimum.at(least, self.pairs.owner[pair], d[at])
 
     def found(self, k: Int[np.ndarray, "n"], low_of: Float[np.ndarray, "owners"]) -> list[Least]:
-        """Return the least gaps of pairs of parts k, where they cease to fall or at an end, with bounds of pairs of links."""
+        """Return the least gaps of the pairs of parts k, located to rounding: where their rate changes its sign, or at an end.
+
+        `low_of` has a lower bound of the gap of each pair of links.
+        """
         motion, s, step = self.motion, self.s[k], self.step[k]
         chain = np.searchsorted(motion.starts, s, side="right") - 1
         first, last = motion.starts[chain], motion.ends[chain]
@@ -288,7 +313,7 @@ class PairSearch:
         return [Least._make(x) for x in zip(*columns, fixed.tolist(), strict=True)]
 
     def touches(self) -> list[tuple[int, Stretches]]:
-        """Return the stretches of u in which pairs of parts touch, with the numbers of the pairs of links."""
+        """Return for each pair of parts that touches the index of its pair of links, and the intervals of u of its contacts."""
         at_start, at_end = self.touching_at_ends
         rows = np.concatenate([np.zeros((5, 0)), *self.crossings], 1)
         k, motion, (s0, s1, d0, d1) = rows[0].astype(int), self.motion, rows[1:]
@@ -306,9 +331,18 @@ class PairSearch:
 def _roots(
     f: Callable[[Any, Any], Any], low: np.ndarray, high: np.ndarray, f_low: np.ndarray, f_high: np.ndarray, guess: np.ndarray
 ) -> Float[np.ndarray, "n"]:
-    """Return roots of functions between places at which their values have different signs; f takes places and indices.
+    """Return a root of each of n functions, from an interval at whose ends its values have different signs.
 
-    Secants, by which one end moves to the root; the value at an end that stays is reduced.
+    The method is that of secants, each of which replaces one end; the value at an end that stays is reduced.
+
+    Args:
+        f: returns the values at some places (first argument) of the functions with the given indices (second argument).
+        low: one end of each interval.
+        high: the other end.
+        f_low: the values at `low`.
+        f_high: the values at `high`.
+        guess: a first place within each interval.
+
     Source: N. Anderson and A. Bjorck, A new high order method of regula falsi type, BIT 13 (1973).
     """
     (a, b), (fa, fb), i = np.array([low, high]), np.array([f_low, f_high]), np.arange(len(low))

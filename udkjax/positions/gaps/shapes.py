@@ -32,7 +32,7 @@ class ConvexPart(NamedTuple):
 
 
 def parts_of(mechanism: Mechanism, shapes: Mapping[str, Any] | None, of: Collection[str]) -> list[ConvexPart]:
-    """Return the parts of the links named in `of`; numbers may be traced.
+    """Return the convex parts of the links named in `of`, from given `shapes` by name or else as drawn; numbers may be traced.
 
     Raises a `SceneError` that names all links whose outlines are missing or wrong.
     """
@@ -70,7 +70,10 @@ def _drawn_parts(name: str, link: Any, points: Any, is_cam: bool) -> list[Convex
 
 
 def _given_parts(mechanism: Mechanism, name: str, shape: Any) -> list[ConvexPart]:
-    """Return the parts of a given width around the pins of a body, of given corners, or of corners with a width around them."""
+    """Return the convex parts of a body from its given shape: a width around its pins, corners, or corners with a width.
+
+    Raises a `ValueError` without the name of the body if the shape is wrong.
+    """
     points, width = shape if isinstance(shape, tuple) and len(shape) == 2 and np.ndim(shape[1]) == 0 else (None, shape)
     if points is None and np.ndim(shape) == 2:
         points, width = shape, 0.0
@@ -86,7 +89,7 @@ def _given_parts(mechanism: Mechanism, name: str, shape: Any) -> list[ConvexPart
 
 
 def _pins(mechanism: Mechanism, name: str) -> Any:
-    """Return the corners of the convex hull of the pins of a body, in its frame."""
+    """Return the corners of the convex hull of the pins of a body, in its frame (m)."""
     if mechanism.drawing is not None and name in mechanism.drawing.groups["link"]:
         points = list(by_numpy(mechanism.drawing.shapes()[name]))
     else:
@@ -120,7 +123,7 @@ def _turn(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> float:
 
 
 def convex_pieces(corners: Any) -> list[Any]:
-    """Return convex pieces of a polygon, anticlockwise: itself if it is convex, else triangles by cutting off ears."""
+    """Return convex pieces of a polygon, anticlockwise: the polygon if it is convex, else triangles, by cutting off ears."""
     points = np.asarray(without_derivatives(corners))
     if len(points) < 3:
         return [corners]
@@ -144,7 +147,7 @@ def convex_pieces(corners: Any) -> list[Any]:
 
 
 def _is_convex(points: np.ndarray, near: float) -> bool:
-    """Return whether a polygon turns left at each corner, and once in all."""
+    """Return True if a polygon turns left at each corner, by one full turn in total; `near` is the rounding error of areas."""
     ways = np.roll(points, -1, axis=0) - points
     after = np.roll(ways, -1, axis=0)
     turns = np.arctan2(ways[:, 0] * after[:, 1] - ways[:, 1] * after[:, 0], (ways * after).sum(1))
@@ -159,7 +162,7 @@ def _contains(triangle: np.ndarray, points: np.ndarray) -> bool:
 
 
 def _cams(mechanism: Mechanism, given: Mapping[str, Any]) -> dict[str, list[ConvexPart]]:
-    """Return the outlines of cams whose shapes are not given: for a roller, that of the path of its centre."""
+    """Return the convex parts of cams by body, unless its shape is given; a cam with a roller has the path of its centre."""
     found: dict[str, list[ConvexPart]] = {}
     for joint in mechanism.joints.values():
         if isinstance(joint, Cam) and joint.bodies[0] not in given:

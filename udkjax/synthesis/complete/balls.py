@@ -26,7 +26,7 @@ class Ball(NamedTuple):
 
     @classmethod
     def of(cls, x: Any, rad: Any = 0.0) -> "Ball":
-        """Return numbers as balls."""
+        """Return balls with midpoints x and radii `rad`."""
         mid = np.asarray(x, LONG)
         return cls(mid, np.broadcast_to(np.asarray(rad, float), mid.shape))
 
@@ -74,13 +74,13 @@ class Ball(NamedTuple):
         return Ball(np.where(least > 0, mid, LONG(0)), np.where(least > 0, rad, np.inf))
 
     def _like(self, x: Any) -> "Ball":
-        """Return numbers as balls of the type of `self`."""
+        """Return x as balls; numbers become balls whose midpoints have the type of those of `self`."""
         if isinstance(x, Ball):
             return x
         return Ball.fractions(x) if self.mid.dtype == object else Ball.of(x)
 
     def part(self, index: Any) -> "Ball":
-        """Return some of the numbers."""
+        """Return the balls that an index of arrays selects."""
         return Ball(self.mid[index], self.rad[index])
 
     @property
@@ -119,7 +119,7 @@ class ComplexBall(NamedTuple):
         return ComplexBall(product.re / size, product.im / size)
 
     def part(self, index: Any) -> "ComplexBall":
-        """Return some of the numbers."""
+        """Return the balls that an index of arrays selects."""
         return ComplexBall(self.re.part(index), self.im.part(index))
 
     def overlaps(self, other: "ComplexBall") -> np.ndarray:

@@ -46,12 +46,12 @@ class Certificate(NamedTuple):
 
     @property
     def balls(self) -> Ball:
-        """The boxes."""
+        """The boxes as balls (N, M), one for each unknown."""
         return Ball(self.middle, self.radius)
 
 
 def certify(system: BallFunction, u: np.ndarray, exact: BallFunction | None = None) -> Certificate:
-    """Improve approximate solutions and prove that exact ones are close to them.
+    """Return approximate solutions, improved, with boxes that are proven, if possible, to contain one exact solution each.
 
     Args:
         system: maps unknowns (N, M) to F (N, M) and F' (N, N, M), as balls.
@@ -84,7 +84,10 @@ def _evaluate(exact: BallFunction, m: np.ndarray) -> Ball:
 
 
 def _prove(system: BallFunction, m: np.ndarray, inverse: np.ndarray, F: Ball) -> Certificate:
-    """Return boxes around points with values F; boxes that satisfy Krawczyk's condition are proven."""
+    """Return boxes around points m, at which the equations have the values F; those with Krawczyk's condition are proven.
+
+    `inverse` has approximate inverses of F' (M, N, N).
+    """
     proven, radius = np.zeros(m.shape[1], bool), np.full(m.shape, np.inf)
     step = _product(inverse, F)
     size = np.maximum(np.abs(m).astype(float), 1.0)
@@ -111,7 +114,7 @@ def _improved(system: BallFunction, m: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def _inverses(A: np.ndarray) -> np.ndarray:
-    """Return inverses; NaN for singular matrices."""
+    """Return the inverses of matrices (M, N, N); NaN for singular ones."""
     with np.errstate(all="ignore"):
         rows = np.max(np.abs(A), axis=2, keepdims=True)
         rows = np.where((rows > 0) & np.isfinite(rows), rows, 1.0)

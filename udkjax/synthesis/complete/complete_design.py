@@ -34,10 +34,17 @@ from udkjax.synthesis.ranges.limits import LengthLimits, Range, read_bounds
 
 
 class _Solutions(NamedTuple):
-    """Four-bars with the radius (m), class and cognate of each, and the counts of solutions.
+    """The solutions for a goal.
 
-    `others` has the kind of each unusable solution and its joints by letter, relative to the first place of the goal, as
-    x + i y and x - i y.
+    Attributes:
+        bars: M proven four-bars.
+        radius: the radius of the certificate of each (m).
+        numbers: the number of the class of each.
+        cognates: the index of each within its class.
+        classes: the number of classes; for poses, the number of dyads.
+        others: the kind of each unusable solution and its joints by letter, relative to the first place of the goal, as x + i y
+            and x - i y.
+        paths: counts of all solutions by outcome.
     """
 
     bars: FourBars
@@ -60,7 +67,7 @@ def design_all(
     transmission: float = 0.0,
     rotation: bool = False,
 ) -> CompleteDesigns:
-    """Find all four-bars that move a pin of the coupler through nine points, or the coupler through five poses.
+    """Return all four-bars that move a pin of the coupler through nine points, or the coupler through five poses.
 
     Nine points have 1,442 classes of complex solutions, all tracked by a homotopy; five poses have four dyads, computed as
     eigenvectors of a matrix. Each real solution is proven: by Krawczyk's theorem, with all rounding errors bounded, exactly one
@@ -81,7 +88,7 @@ def design_all(
         rotation: whether the driver has to make a whole turn.
 
     Returns:
-        `CompleteDesigns`, those without defects first.
+        A `CompleteDesigns`, in which designs without defects come first.
 
     Raises:
         SceneError: the drawing is not a four-bar, the driver does not turn a crank, or a limit is invalid.
@@ -163,7 +170,7 @@ class _Limits:
 
 
 class CompleteSearch(NamedTuple):
-    """The arguments of `design_all`, such as those of a file."""
+    """A search by `design_all` with its arguments, such as those of a file; a call runs it."""
 
     mechanism: Mechanism
     goal: PathGoal | PoseGoal

@@ -140,7 +140,7 @@ class CompleteDesigns(PrintsTable):
 
     @property
     def unproven(self) -> int:
-        """The number of further classes that appear to be real without a proof."""
+        """The number of classes, or dyads, that appear to be real but are not proven; `classes` does not include them."""
         return sum(other.kind == "unproven" for other in self.others)
 
     def __len__(self) -> int:

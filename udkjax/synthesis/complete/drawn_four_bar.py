@@ -36,17 +36,17 @@ class DrawnFourBar(NamedTuple):
     is_reversed: bool
 
     def places(self, bars: FourBars, which: np.ndarray, position: np.ndarray) -> dict[str, np.ndarray]:
-        """Return the places (M, 2) of the pins of M four-bars by name, each in the position of index (M,)."""
+        """Return the places (M, 2) of pins by name, for the four-bars `which` (M,), each in the position with an index (M,)."""
         joints = {"O": bars.O[which], "C": bars.C[which], "P": bars.P[position]}
         joints |= {"A": bars.A[which, position], "B": bars.B[which, position]}
         return {f"pin.{self.pins[key]}": np.stack([np.real(z), np.imag(z)], 1) for key, z in joints.items()}
 
     def coordinates(self, joints: Mapping[str, np.ndarray], start: np.ndarray) -> dict[str, np.ndarray]:
-        """Return complex x, y (2,) by the names of pins, from x + i y and x - i y of joints relative to a place (2,)."""
+        """Return complex x and y (2,) by the name of a pin, from x + i y and x - i y by the letter of a joint, minus `start`."""
         return {f"pin.{self.pins[key]}": start + np.array([z + w, (z - w) / 1j]) / 2 for key, (z, w) in joints.items()}
 
     def values(self, bars: FourBars, angles: np.ndarray) -> np.ndarray:
-        """Return the driver's values (M, J) (rad) at crank angles, with the origin of the drawn mechanism's driver."""
+        """Return the driver's values (M, J) (rad) for crank angles (M, J), from the value in the drawn first position."""
         drawn = bars.crank_angles[:, :1] + np.pi * self.is_reversed
         drawn = drawn - 2 * np.pi * np.ceil((drawn - np.pi) / (2 * np.pi))
         return self.sign * (drawn + angles - angles[:, :1])

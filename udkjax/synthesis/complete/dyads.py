@@ -29,7 +29,7 @@ ArrayOrBall = Any  # arrays or balls
 
 
 class Displacements(NamedTuple):
-    """Displacements of the traced point from its first position (J, 1); optionally cosines minus one and sines of the turns."""
+    """Displacements x, y of the traced point from its first position (J, 1), optionally with turns: cosines - 1, and sines."""
 
     x: ArrayOrBall
     y: ArrayOrBall
@@ -38,14 +38,14 @@ class Displacements(NamedTuple):
 
 
 class DyadEquations(NamedTuple):
-    """g at all displacements (J, M), and its derivatives with respect to x (two), r (two), p and s, (6, J, M)."""
+    """The values of g at all displacements (J, M), and six derivatives (J, M) each: by x (two), r (two), p and s."""
 
     g: ArrayOrBall
     slopes: tuple[ArrayOrBall, ...]
 
 
 def dyad_equations(x: ArrayOrBall, y: ArrayOrBall, a: ArrayOrBall, b: ArrayOrBall, d: Displacements) -> DyadEquations:
-    """Return the equations of a moving joint (x, y) and a crank (a, b)."""
+    """Return the equations g of a dyad with the moving joint (x, y) and the crank (a, b), at displacements d."""
     p, s = d.p, d.s
     ex, ey = d.x + (p * x - s * y), d.y + (s * x + p * y)
     wx, wy = ex + a, ey + b
@@ -54,7 +54,10 @@ def dyad_equations(x: ArrayOrBall, y: ArrayOrBall, a: ArrayOrBall, b: ArrayOrBal
 
 
 def dyad_system(d: Displacements):
-    """Return the system of one dyad with given turns of its link: four equations for the joint and the crank."""
+    """Return the system of one dyad through five poses, as `certify` requires it: a function of the joint and the crank (4, M).
+
+    It returns four equations and their derivatives, as balls. `d` includes the turns of the link.
+    """
 
     def system(u: Ball) -> tuple[Ball, Ball]:
         x, y, a, b = (u.part(k) for k in range(4))
@@ -67,10 +70,10 @@ def dyad_system(d: Displacements):
 
 
 def four_bar_system(d: Displacements):
-    """Return the system of a four-bar through points: two dyads and the J turns of their link.
+    """Return the system of a four-bar through points, as `certify` requires it: a function of unknowns (8 + 2 J, M).
 
-    The unknowns are joint and crank of the first dyad, joint and crank of the second, J cosines minus one, and J sines; the
-    equations are g = 0 for both dyads, and (p^2 + s^2) / 2 + p = 0.
+    The unknowns are joint and crank of the first dyad, joint and crank of the second, J cosines minus one, and J sines of the
+    turns of the coupler. The equations are g = 0 for both dyads, and (p^2 + s^2) / 2 + p = 0.
     """
 
     def system(u: Ball) -> tuple[Ball, Ball]:
@@ -151,7 +154,10 @@ def newton_and_tangent() -> ScalarProgram:
 def _dyad(
     joints: list[ComplexScalar], f: ComplexScalar, d: ComplexScalar, D: ComplexScalar, moves: tuple[ComplexScalar, ComplexScalar]
 ) -> tuple[ComplexScalar, list[ComplexScalar], list[ComplexScalar]]:
-    """Return dg/df, the derivatives with respect to x, X, r, R, and -g and -dg/ds."""
+    """Return the derivatives of a dyad's g by f and by x, X, r, R, and the right-hand sides -g and -dg/ds.
+
+    `moves` are the derivatives of d and D by s.
+    """
     x, X, r, R = joints
     inverse = ComplexScalar(f.re + 1.0, f.im).inverse()
     F = -(f * inverse)

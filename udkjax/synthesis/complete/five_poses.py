@@ -80,7 +80,7 @@ def find_real_dyads(poses: np.ndarray) -> RealDyads:
 
 
 def _first_of_each(first: Certificate) -> np.ndarray:
-    """Return a mask of the boxes that do not overlap an earlier one."""
+    """Return a mask of the boxes that overlap no earlier box of the mask."""
     keep = np.ones(len(first.is_proven), bool)
     for j, i in combinations(range(len(keep)), 2):
         keep[i] &= not (keep[j] and first.balls.part(np.s_[:, i]).overlaps(first.balls.part(np.s_[:, j])).all())
@@ -88,7 +88,7 @@ def _first_of_each(first: Certificate) -> np.ndarray:
 
 
 def _zeros(dx: np.ndarray, dy: np.ndarray, p: np.ndarray, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return homogeneous joints (3, 4) and pivots (3, 4) of all dyads, complex."""
+    """Return homogeneous joints (3, 4) and pivots (3, 4) of all dyads, complex, from displacements and turns (4,) of poses."""
     half = 0.5 * (dx**2 + dy**2)
     # L[j, k]: coefficients by (x, y, 1) of entry k of row j. Joints are in units of `size`, which is large if the link turns
     # little.

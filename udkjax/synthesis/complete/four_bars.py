@@ -45,7 +45,7 @@ class FourBars(NamedTuple):
         return FourBars(self.O[which], self.C[which], self.A[which], self.B[which], self.P)
 
     def swapped(self) -> "FourBars":
-        """Return the same four-bars, driven from the other side."""
+        """Return the same four-bars, with crank and rocker exchanged."""
         return FourBars(self.C, self.O, self.B, self.A, self.P)
 
     def cognates(self) -> "tuple[FourBars, FourBars, FourBars]":
@@ -81,7 +81,7 @@ class FourBars(NamedTuple):
 
 
 def stack_four_bars(batches: list[FourBars]) -> FourBars:
-    """Return several batches concatenated."""
+    """Return several batches of four-bars through the same points as one batch."""
     O, C, A, B = (np.concatenate([getattr(batch, name) for batch in batches]) for name in FourBars._fields[:-1])  # noqa: E741
     return FourBars(O, C, A, B, batches[0].P)
 
@@ -109,7 +109,7 @@ class Classification(NamedTuple):
 
 
 def classify(bars: FourBars) -> Classification:
-    """Classify four-bars by lengths and angles."""
+    """Return the kinds of four-bars, and the circuits, branches and order of their positions, from lengths and angles."""
     lengths = bars.lengths
     total, longest, shortest = lengths.sum(axis=0), lengths.max(axis=0), lengths.min(axis=0)
     is_grashof = 2.0 * (shortest + longest) < total
@@ -160,7 +160,10 @@ def _counted(labels: np.ndarray) -> np.ndarray:
 
 
 def _order(circle: np.ndarray, exists: np.ndarray) -> np.ndarray:
-    """Return the indices of positions in their order along a circle from the first one (M, J), padded with -1."""
+    """Return the indices of positions in their order along a circle from the first one (M, J), padded with -1.
+
+    `circle` has the angles of positions along the circle; positions of which `exists` is False are left out.
+    """
     away = np.where(exists, circle, np.inf)
     away = np.where(away < circle[:, :1], away + 1e3, away)
     order = np.argsort(away, axis=1, kind="stable")
@@ -174,7 +177,7 @@ def _goes_round(order: np.ndarray) -> np.ndarray:
 
 
 def _values(angle: np.ndarray, turns: np.ndarray) -> np.ndarray:
-    """Return angles (M, J) along a motion; a crank that turns fully moves in the shorter direction."""
+    """Return crank angles (M, J) along a motion; those of a crank that turns fully are continuous, in the shorter direction."""
     ahead, back = (np.cumsum(np.mod(sign * np.diff(angle, axis=1, prepend=angle[:, :1]), 2 * np.pi), axis=1) for sign in (1, -1))
     shorter = np.where((ahead[:, -1] <= back[:, -1])[:, None], ahead, -back)
     return np.where(turns[:, None], angle[:, :1] + shorter, angle)
@@ -184,7 +187,10 @@ def _values(angle: np.ndarray, turns: np.ndarray) -> np.ndarray:
 
 
 class FourBarBoxes(NamedTuple):
-    """Fixed joints O, C and moving joints A, B of four-bars (M,) in the first position, relative to the first place."""
+    """Balls that contain the joints of M exact four-bars in the first position, relative to the first place of the goal.
+
+    O and C are the fixed joints, A and B the moving ones.
+    """
 
     O: ComplexBall  # noqa: E741  # as it is drawn
     C: ComplexBall
@@ -193,7 +199,7 @@ class FourBarBoxes(NamedTuple):
 
 
 def cognate_joints(boxes: Certificate) -> tuple[FourBarBoxes, FourBarBoxes, FourBarBoxes]:
-    """Return the joints of all three cognates, in the order of `FourBars.cognates`."""
+    """Return the joints of all three cognates of the solutions in boxes, in the order of `FourBars.cognates`."""
     u = boxes.balls
     x, r, y, s = (ComplexBall(u.part(k), u.part(k + 1)) for k in (0, 2, 4, 6))
     a, b = x - r, y - s
@@ -215,7 +221,10 @@ def radius_of(boxes: FourBarBoxes, bars: FourBars, origin: complex, scale: float
 
 
 def certainly_different(boxes: Certificate) -> np.ndarray:
-    """Return the indices of boxes that are proven to contain different classes: their three pivots differ in any order."""
+    """Return the indices of the boxes that are proven to contain other classes than all boxes before them.
+
+    The three pivots of their cognates differ in any order.
+    """
     first, second, _ = cognate_joints(boxes)
     pivots, count = (first.O, first.C, second.C), boxes.middle.shape[1]
     rows, columns = np.arange(count)[:, None], np.arange(count)[None, :]

@@ -52,7 +52,7 @@ def check_motions(bars: FourBars, classification: Classification) -> np.ndarray:
 
 @cache
 def skeleton() -> PositionBatch:
-    """Return a compiled solver for positions of four-bars; the traced point and the masses do not matter."""
+    """Return the compiled solver for positions of four-bars by their pins O, A, B, C, which is cached."""
     pins = {"O": (0.0, 0.0), "A": (3.0, 4.0), "B": (12.0, 9.0), "C": (10.0, 0.0)}
     links = {name: {"pins": list(ends), "mass": 1.0} for name, ends in (("crank", "OA"), ("coupler", "AB"), ("rocker", "CB"))}
     mechanism = Drawing(pins, links, ground=["O", "C"]).mechanism()
@@ -60,7 +60,7 @@ def skeleton() -> PositionBatch:
 
 
 def _motions_of(m: int, classification: Classification) -> list[_BranchMotion]:
-    """Return the motions along each branch: one full turn of the crank, or both directions from the first position."""
+    """Return the motions of four-bar m along each branch: a turn of the crank, or both directions from the first position."""
     motions = []
     for branch in range(classification.branches[m].max() + 1):
         places = np.flatnonzero(classification.branches[m] == branch)

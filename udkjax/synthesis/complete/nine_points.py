@@ -81,7 +81,7 @@ class RealClasses(NamedTuple):
 
     @property
     def unproven(self) -> int:
-        """The number of further classes that appear to be real."""
+        """The number of classes that appear to be real but are not proven."""
         return self.ends.kinds.count("unproven")
 
 
@@ -232,14 +232,14 @@ def class_keys(z: np.ndarray) -> np.ndarray:
 
 
 def repeated(z: np.ndarray, which: np.ndarray) -> np.ndarray:
-    """Return a mask of the solutions (M,) whose class occurs more than once."""
+    """Return a mask (M,) of the solutions whose class occurs more than once among those that the mask `which` selects."""
     mask, places = np.zeros(z.shape[1], bool), np.flatnonzero(which)
     mask[places[np.unique(_pairs(z[:, places]))]] = True
     return mask
 
 
 def distinct(z: np.ndarray, most: float = CLASSES) -> np.ndarray:
-    """Return the indices of the first solution of each class, at most `most` of them."""
+    """Return the indices of the first solution of each class; the tolerance is raised until there are at most `most` classes."""
     alike = ALIKE
     while True:
         keep = np.ones(z.shape[1], bool)
@@ -272,7 +272,7 @@ def _merged(*sets: np.ndarray) -> np.ndarray:
 
 
 def _refined(z: np.ndarray, status: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return ends (16, M) and their status; unconverged ends are refined in long precision."""
+    """Return ends of paths (16, M) and their status; ends not accepted are refined in long precision, and accepted if regular."""
     status, z = status.copy(), z.copy()
     open_ends = np.flatnonzero((status != ACCEPTED) & np.isfinite(z).all(axis=0))
     if not len(open_ends):

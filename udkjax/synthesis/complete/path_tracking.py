@@ -28,9 +28,12 @@ ACCEPTED, INFINITE, SINGULAR, LOST = 0, 1, 2, 3  # codes of the ends of paths
 
 
 class Precision(NamedTuple):
-    """Bounds of the aimed-at prediction error and of the first and second correction, relative to the unknowns.
+    """The precision of path tracking; the smaller its bounds, the less likely is a jump from one path to another.
 
-    The smaller the bounds, the less likely is a jump from one path to another.
+    Attributes:
+        aim: the prediction error to which the length of steps is adapted, relative to the unknowns.
+        first: the largest first correction of an accepted step, relative to the unknowns.
+        second: the largest second correction.
     """
 
     aim: float = 1e-3
@@ -56,7 +59,19 @@ class TrackedPaths(NamedTuple):
 
 
 class _Points(NamedTuple):
-    """Active paths: point, rate and t, the same one step before, the next step, its number, and the index of the path."""
+    """Points of active paths.
+
+    Attributes:
+        z: the unknowns (N, M).
+        rate: dz/dt.
+        t: the parameter (M,).
+        z_before: the unknowns one step before.
+        rate_before: dz/dt one step before.
+        last: the length of the last step in t; zero before the first one.
+        step: the length of the next step.
+        taken: the number of steps so far.
+        path: the index of the path.
+    """
 
     z: np.ndarray
     rate: np.ndarray
@@ -73,7 +88,7 @@ class _Points(NamedTuple):
 
 
 class PathTracker:
-    """Follow solutions of a system along lines of its parameters.
+    """A tracker of the solutions of a system along a line of its parameters; a call tracks M paths at once.
 
     Args:
         program: maps real and imaginary parts of z (N) and s, and of p0 and p1 - p0, to those of the Newton step and of dz/ds.
@@ -93,7 +108,7 @@ class PathTracker:
         bend: float = 0.0,
         most: int = 3000,
     ) -> TrackedPaths:
-        """Follow the solutions z (N, M) at the parameters `start` to those at `end`.
+        """Return the ends of the paths from the solutions z (N, M) at the parameters `start` to solutions at `end`.
 
         Args:
             z: solutions.
@@ -130,7 +145,7 @@ class PathTracker:
         return TrackedPaths(out, status, reached, taken)
 
     def polish(self, z: np.ndarray, parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return solutions (N, M) at some parameters by Newton's method, and whether each converged up to rounding errors."""
+        """Return the solutions (N, M) near z at some parameters, by Newton's method, and a mask of those that have converged."""
         shared = np.concatenate([np.real(parameters), np.imag(parameters), np.zeros(2 * len(parameters))])
         zeros, best = np.zeros(z.shape[1]), np.full(z.shape[1], np.inf)
         for _ in range(END_CORRECTIONS):
@@ -143,14 +158,14 @@ class PathTracker:
         return z, best < END_TOL
 
     def _evaluate(self, z: np.ndarray, t: np.ndarray, bend: float, shared: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the Newton step and dz/dt."""
+        """Return the Newton step and dz/dt (N, M) at points z and t; `shared` has the parameters of all paths."""
         n = self.unknowns
         outputs = self._program(np.concatenate([np.real(z), np.imag(z), t[None], (bend * t * (1.0 - t))[None]]), shared)
         step, rate = (outputs[k : k + n] + 1j * outputs[k + n : k + 2 * n] for k in (0, 2 * n))
         return step, rate * (1.0 + 1j * bend * (1.0 - 2.0 * t))
 
     def _advance(self, p: _Points, bend: float, shared: np.ndarray, precision: Precision) -> _Points:
-        """Try a step of each path; accept or shorten it."""
+        """Return the points after a step of each path; where it is not accepted, the old point with a shorter next step."""
         step = np.minimum(p.step, 1.0 - p.t)
         t = np.where(p.step >= 1.0 - p.t, 1.0, p.t + step)
         guess = _predict(p, step)
@@ -180,7 +195,7 @@ def _ends(p: _Points) -> np.ndarray:
 
 
 def _predict(p: _Points, step: np.ndarray) -> np.ndarray:
-    """Extrapolate the cubic through the last two points; the first step, the tangent."""
+    """Return the prediction a step ahead: by the cubic through the last two points; for the first step, along the tangent."""
     has_two = p.last > 0
     last_step = np.where(has_two, p.last, 1.0)
     u = 1.0 + step / last_step

@@ -5,7 +5,8 @@ With the distances d of points from the nearest place of the other polyline, and
     sum_i sigma_i rho(d_i) + mean_j rho(d_j)
 
 over the points i of the curve and j of the target; sigma_i are shares of the curve's length. The derivative of a distance is that
-with the nearest place held. For steps, distances along normals count in full, and tangential moves hardly, except past an end.
+with the nearest place held. In the second derivatives for steps, distances along normals have full weight and tangential ones
+little, except past an end.
 
 Source: E. Weiszfeld, "Sur le point pour lequel la somme des distances de n points donnés est minimum", 1937 (weights);
 S. Rusinkiewicz and M. Levoy, "Efficient variants of the ICP algorithm", 2001 (distances along normals).
@@ -40,7 +41,15 @@ class CurveComparison(NamedTuple):
 
 
 class _Feet(NamedTuple):
-    """Nearest places of a polyline: offsets from them, and their shares of the ways to the next (True) or the previous vertex."""
+    """The places of a polyline that are nearest to points, each on a segment from the nearest vertex to one of its neighbours.
+
+    Attributes:
+        offset: the vector from the nearest place to the point, complex.
+        share: the distance of the place from the vertex, as a fraction of the segment.
+        is_next: whether the neighbour is the next vertex; otherwise it is the previous one.
+        normal: the unit normal of the segment, complex.
+        is_between: whether the place is not at an end of the segment.
+    """
 
     offset: np.ndarray
     share: np.ndarray
@@ -50,7 +59,7 @@ class _Feet(NamedTuple):
 
 
 def _feet(p: np.ndarray, vertex: np.ndarray, following: np.ndarray, previous: np.ndarray) -> _Feet:
-    """Return the nearest places of points on the segments to the neighbours of their nearest vertices."""
+    """Return the places nearest to points p, on the segments from each `vertex` to its neighbours `following` and `previous`."""
     found = []
     for way in (following - vertex, previous - vertex):
         square = np.real(way) ** 2 + np.imag(way) ** 2
@@ -64,7 +73,7 @@ def _feet(p: np.ndarray, vertex: np.ndarray, following: np.ndarray, previous: np
 
 
 def _pairs(offset: np.ndarray, feet: _Feet, blur: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return rho, its derivatives with respect to the offsets, and second derivatives xx, xy, yy."""
+    """Return rho, its derivatives with respect to the offsets, d/dx + i d/dy, and positive second derivatives xx, xy, yy."""
     length = np.sqrt(np.real(offset) ** 2 + np.imag(offset) ** 2 + blur**2)
     x, y, weight = np.real(feet.normal), np.imag(feet.normal), 1.0 / length
     along = np.where(feet.is_between, ALONG, 1.0)
@@ -73,7 +82,7 @@ def _pairs(offset: np.ndarray, feet: _Feet, blur: float) -> tuple[np.ndarray, np
 
 
 def compare(c: np.ndarray, target: CurveTarget, is_whole: bool, blur: float) -> CurveComparison:
-    """Compare curves (K, N) with a target.
+    """Return the smooth Chamfer distances of curves (K, N) from a target, with derivatives.
 
     Args:
         c: complex points of the curves.

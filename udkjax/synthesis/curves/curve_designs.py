@@ -119,7 +119,10 @@ def confirmed(found: FoundLinkage, wanted: WantedCurve, name: str, unit: str) ->
 
 
 def ranked(found: dict[int, list[FoundLinkage]], wanted: WantedCurve, count: int, worth: float, unit: str) -> list[CurveDesign]:
-    """Return the best different designs by error and simplicity: two more bars must reduce the error by the fraction `worth`."""
+    """Return up to `count` different, confirmed designs, the best first by error and simplicity.
+
+    Two more bars must reduce the error by the fraction `worth`. `found` has linkages by the number of bars.
+    """
     every = sorted((one for same in found.values() for one in same), key=lambda one: one.error / (1.0 - worth) ** (one.bars / 2))
     chosen: list[CurveDesign] = []
     errors: list[tuple[bytes, float]] = []

@@ -31,7 +31,7 @@ CHECKED = 1440  # angles of a turn at which limits are verified
 
 
 class Kept(NamedTuple):
-    """Linkages of the same number of bars with their losses, and the starts from which they come."""
+    """Linkages of the same number of bars: numbers x, structures, losses, and the index of the start from which each grew."""
 
     x: np.ndarray
     topology: Topology
@@ -39,11 +39,11 @@ class Kept(NamedTuple):
     family: np.ndarray
 
     def take(self, which: np.ndarray) -> "Kept":
-        """Return the selected linkages."""
+        """Return the linkages that `which`, a mask or indices, selects."""
         return Kept(self.x[which], self.topology.take(which), self.loss[which], self.family[which])
 
     def with_others(self, other: "Kept | None") -> "Kept":
-        """Return these linkages and others."""
+        """Return these linkages together with others, if there are any."""
         if other is None:
             return self
         joined = [np.concatenate(pair) for pair in zip(self.topology, other.topology, strict=True)]
@@ -51,7 +51,7 @@ class Kept(NamedTuple):
         return Kept(rest[0], Topology(*joined), rest[1], rest[2])
 
     def best(self, count: int, family: int) -> "Kept":
-        """Return the best different linkages, at most `family` of them from the same start."""
+        """Return the best different linkages, at most `count`, and at most `family` of them from the same start."""
         chosen: list[int] = []
         for k in np.argsort(self.loss, kind="stable"):
             if not np.isfinite(self.loss[k]) or len(chosen) == count:
@@ -86,7 +86,7 @@ class FoundLinkage(NamedTuple):
 
 
 class CurveSearch:
-    """A search in rounds. All results follow from the seed and the number of stages: no decision depends on time.
+    """A search in rounds, each of several stages. Results follow from the seed and the number of stages, not from time.
 
     Args:
         wanted: the wanted curve.
@@ -115,7 +115,7 @@ class CurveSearch:
         self.until = np.inf  # CPU time (`time.process_time`) after which descents end early
 
     def stages(self) -> Iterator[str]:
-        """Run the search, without end; yield a description of each stage when it is completed.
+        """Run the search without end, and yield a description of each stage after it.
 
         A round begins anew, since what grows best is not known from its start; then the best linkages of all rounds grow again.
         """
@@ -142,15 +142,19 @@ class CurveSearch:
         return min((one.error for found in self.found.values() for one in found), default=np.inf)
 
     def promises(self, error: float) -> bool:
-        """Return True if an unfinished linkage may have such an error when finished: it has no more than twice as much."""
+        """Return True if an unfinished linkage of this round may reach an error when finished: its loss is at most twice that."""
         blur = OF_GROWTH[-1][0]
         losses = [loss for kept in self.fresh.values() for loss in kept.loss if loss not in self.finished]
         return min(losses, default=np.inf) <= 2.0 * (np.hypot(error, blur) - blur)
 
     def finish(self, until: float = np.inf) -> None:
-        """Finish the best linkages, also of an incomplete round; after a time only the most promising, until there is one.
+        """Improve the best linkages of each number of bars by last, exact steps, and store those that turn within the limits.
 
-        Of each number of bars, the next ones are tried while none was within the limits.
+        If none of the best turns, the next ones are tried. Linkages of an incomplete round are included.
+
+        Args:
+            until: CPU time (`time.process_time`) after which only the most promising number of bars is tried, or further ones
+                until a linkage is found.
         """
         self._merge()
         order = sorted((n for n, kept in self.beams.items() if len(kept.x)), key=lambda n: self.beams[n].loss[0])
@@ -194,7 +198,7 @@ class CurveSearch:
         return kept
 
     def _descend(self, x: np.ndarray, topology: Topology, task: Task, blur: float, steps: int) -> Descended:
-        """Improve linkages in batches, on all threads."""
+        """Return the results of `descend` for linkages, in batches on all threads."""
         self.candidates += len(x)
         batches = [slice(k, k + LANES) for k in range(0, len(x), LANES)]
         given = task, blur, steps, self.until
@@ -202,7 +206,7 @@ class CurveSearch:
         return Descended(*(np.concatenate(a) for a in zip(*results, strict=True)))
 
     def _finish(self, bars: int) -> bool:
-        """Finish the best linkages of a number of bars, or the next ones; return True while there may be more and none turned."""
+        """Finish the best unfinished linkages of a number of bars; return True if there may be more and none has turned."""
         kept = self.beams[bars]
         new = [k for k, loss in enumerate(kept.loss) if loss not in self.finished and (k < FINISHED or bars not in self.turned)]
         if not new:
@@ -222,7 +226,7 @@ class CurveSearch:
         return bars not in self.turned
 
     def verified(self, x: np.ndarray, topology: Topology) -> FoundLinkage | None:
-        """Return the linkage if it is within the limits over the whole turn."""
+        """Return the linkage with its error if it is within the limits over the whole turn, else None."""
         at = positions(x[None], topology, np.arange(CHECKED)[None] * (2 * np.pi / CHECKED), 0.0)
         joints = np.concatenate(
             [at.origins[1:] if topology.ratio[0] else np.delete(at.origins[1:], GEARED - 1, 0), at.ends, at.pin[None]]

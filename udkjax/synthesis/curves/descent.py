@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt steps of linkages in lanes, towards a small Chamfer distance from a target.
+"""Levenberg-Marquardt steps of many linkages at once, towards a small Chamfer distance of their curves from a target.
 
 The gradient of `comparison` is exact; nearest places and weights are held within a step. Violations of limits are least squares.
 """
@@ -60,7 +60,14 @@ class LinkageLimits(NamedTuple):
 
 
 class Sampling(NamedTuple):
-    """Angles of the crank: share span + rest (2 pi - span). The first `drawing` of them draw the curve."""
+    """T angles of the crank: share span + rest (2 pi - span), with the part of the turn `span` that draws the curve.
+
+    Attributes:
+        share: fractions of this part (T,).
+        rest: fractions of the rest of the turn (T,).
+        drawing: the number of angles, the first ones, at which the curve is drawn.
+        is_whole: whether the whole turn draws the curve.
+    """
 
     share: np.ndarray
     rest: np.ndarray
@@ -68,7 +75,7 @@ class Sampling(NamedTuple):
     is_whole: bool
 
     def angles(self, x: np.ndarray) -> np.ndarray:
-        """Return the angles (K, T) of linkages."""
+        """Return the angles (K, T) of linkages with the numbers x (K, numbers)."""
         span = x[:, SPAN, None]
         return span * self.share + (FULL_TURN - span) * self.rest
 
@@ -83,7 +90,7 @@ def sampling(drawing: int, resting: int, is_whole: bool) -> Sampling:
 
 
 class Task(NamedTuple):
-    """The target, the angles at which linkages are compared with it, and the limits."""
+    """The task of a descent: the target, the angles at which linkages are compared with it, and the limits."""
 
     target: CurveTarget
     sample: Sampling
@@ -124,7 +131,7 @@ def _violation(at: DyadPositions, limits: LinkageLimits) -> _Violation:
 
 
 def evaluate(x: np.ndarray, topology: Topology, task: Task, blur: float) -> tuple[np.ndarray, ...]:
-    """Return losses, Chamfer distances and largest violations (K,), and matrices and gradients of the step's equations."""
+    """Return losses, Chamfer distances and largest violations (K,) of linkages, and A and b of the equations A dx = -b."""
     sample, limits = task.sample, task.limits
     at = positions(x, topology, sample.angles(x))
     violation = _violation(at, limits)
@@ -148,12 +155,12 @@ def evaluate(x: np.ndarray, topology: Topology, task: Task, blur: float) -> tupl
 
 
 def descend(x: np.ndarray, topology: Topology, task: Task, blur: float, steps: int, until: float = np.inf) -> Descended:
-    """Improve linkages (K, numbers) by a number of steps, each on its own.
+    """Return linkages (K, numbers), each improved independently by a number of steps, with their losses.
 
     Args:
         x: the numbers of the linkages.
         topology: their structures.
-        task: the target.
+        task: the target, the angles of the crank, and the limits.
         blur: distance (RMS radii) below which squares are minimized.
         steps: number of steps.
         until: CPU time (`time.process_time`) after which it ends early.

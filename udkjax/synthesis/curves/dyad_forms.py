@@ -23,7 +23,10 @@ APART = 0.05
 
 
 class Dyads(NamedTuple):
-    """Dyads of one form at angles of the crank (K, T): joints, turns of their links, their numbers (K, 1), and cosines."""
+    """Dyads of one form at angles of the crank: joints P, Q, R, and the unit numbers exp(i angle) of both links, (K, T) each.
+
+    `one` and `two` (K, 1) are the numbers of the form; `cosine` (K, T) is that of the angle between both links.
+    """
 
     P: np.ndarray
     Q: np.ndarray
@@ -36,13 +39,13 @@ class Dyads(NamedTuple):
 
 
 class DyadForces(NamedTuple):
-    """Equilibrium of dyads, for three measures (K, 3, T).
+    """Internal forces of dyads in equilibrium, and derivatives that follow from them, for three measures (K, 3, T).
 
     Attributes:
-        force: from the first link on the other one, at Q, or R on a rail.
-        couple: on the link that carries the rail.
+        force: the force from the first link on the second one, at Q, or at R on a rail, complex.
+        couple: the couple on the link that carries the rail.
         by_one: derivatives of the measures with respect to `one`.
-        by_two: likewise, to `two`.
+        by_two: derivatives of the measures with respect to `two`.
     """
 
     force: np.ndarray
@@ -57,12 +60,12 @@ def dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return the moments of vectors b at arms a."""
+    """Return the cross products of vectors a and b: the moments of forces b at arms a."""
     return np.real(a) * np.imag(b) - np.imag(a) * np.real(b)
 
 
 def lanes_of_forms(form: np.ndarray) -> Iterator[tuple[int, Any]]:
-    """Iterate over the forms of dyads (K,), each with an index of its lanes."""
+    """Yield each form that occurs among K dyads, with an index of the dyads that have it."""
     if (form == form[0]).all():
         yield int(form[0]), slice(None)
     else:
@@ -79,7 +82,18 @@ def place(
     side: np.ndarray,
     least: float,
 ) -> tuple[Dyads, np.ndarray]:
-    """Return dyads, and the origins of their second links; `turn` is that of the link of Q, `least` the smallest sine."""
+    """Return the positions of dyads of a form, and the origins of their second links.
+
+    Args:
+        form: PINS, RAIL or SLIDE.
+        P: the joints P (K, T).
+        Q: the joints Q.
+        turn: the unit numbers exp(i angle) of the links that carry Q.
+        one: the first number of the form (K, 1).
+        two: the second number.
+        side: 1 or -1, the side of P-Q on which R is (K, 1).
+        least: the sine of the angle between both links that replaces a smaller one, where a dyad cannot be closed.
+    """
     way = Q - P
     square = np.real(way) ** 2 + np.imag(way) ** 2 + TINY
     if form == PINS:
@@ -105,9 +119,15 @@ def _sine(cosine: np.ndarray, least: float) -> np.ndarray:
 def balance(
     form: int, dyads: Dyads, moment1: np.ndarray, force2: np.ndarray, moment2: np.ndarray, squeeze: np.ndarray
 ) -> DyadForces:
-    """Return the equilibrium of dyads under loads of their links (K, 3, T) about their origins.
+    """Return the internal forces of dyads whose links carry loads (K, 3, T).
 
-    `squeeze` (K, T) are derivatives of the third measure with respect to the cosines.
+    Args:
+        form: PINS, RAIL or SLIDE.
+        dyads: the positions of the dyads.
+        moment1: the moment on the first link, about its origin.
+        force2: the force on the second link, complex.
+        moment2: the moment on the second link, about its origin.
+        squeeze: the derivative of the third measure with respect to the cosine (K, T).
     """
     P, Q, R, turn1, turn2, one, two, cosine = dyads
     e1, e2, s = turn1[:, None], turn2[:, None], squeeze

@@ -1,4 +1,4 @@
-"""Linkages of dyads in lanes: every position by an intersection of circles or lines, derivatives by statics.
+"""Linkages of dyads in lanes, many at once: every position by an intersection of circles or lines, derivatives by statics.
 
 Link 0 is the ground, link 1 the crank, link 2 a second crank that turns `ratio` times as fast, by a belt. Dyad d adds the links
 3 + 2 d, with its joint P on one link, and 4 + 2 d, with its joint Q on another one; `dyad_forms` says how these two are joined.
@@ -39,7 +39,7 @@ class Topology(NamedTuple):
     ratio: np.ndarray
 
     def take(self, which: Any) -> "Topology":
-        """Return the selected linkages."""
+        """Return the structures that `which`, a mask or indices, selects."""
         return Topology(*(a[which] for a in self))
 
     @property
@@ -67,7 +67,7 @@ class DyadPositions(NamedTuple):
 
 
 def number_count(dyads: int) -> int:
-    """Return the number of numbers of a linkage."""
+    """Return the length of the vector x of a linkage with this number of dyads."""
     return HEAD + EACH * dyads + TAIL
 
 
@@ -120,9 +120,9 @@ def gradients(
         topology: their structures.
         at: their positions.
         share: derivative of the crank's angle with respect to the part of the turn that draws the curve (T,).
-        pulls: derivatives of the third measure with respect to the joints P and Q (2, D, K, T).
-        pushes: likewise, to the joints R (D, K, T).
-        squeeze: likewise, to the cosines (D, K, T).
+        pulls: derivatives of the third measure with respect to the joints P and Q (2, D, K, T), complex.
+        pushes: derivatives of the third measure with respect to the joints R (D, K, T), complex.
+        squeeze: derivatives of the third measure with respect to the cosines (D, K, T).
     """
     z, u = at.origins, at.turns
     L, K, T = z.shape

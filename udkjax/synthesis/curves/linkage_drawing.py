@@ -34,7 +34,7 @@ LinkPoint = tuple[int, complex]  # number of a link, and a place in its frame
 
 
 def pins_of_linkage(x: np.ndarray, topology: Topology) -> dict[str, list[LinkPoint]]:
-    """Return the pins by name, each as a point of the links that it joins."""
+    """Return the pins of a linkage by name, each as a list of the links that it joins, with its place in their frames."""
     pins: dict[str, list[LinkPoint]] = {"O": [(0, complex(x[0], x[1])), (1, 0j)]}
     if topology.ratio[0]:
         pins["O2"] = [(0, complex(x[SECOND], x[SECOND + 1])), (GEARED, 0j)]
@@ -90,7 +90,14 @@ def drawing_of(x: np.ndarray, topology: Topology, wanted: WantedCurve, name: str
 
 
 def _link(pins: list[str], places: dict[str, complex], extent: float, size: float) -> dict[str, Any]:
-    """Return the table of a link: a disc or a bar, or a plate whose corners are in order about its middle."""
+    """Return a link as a table for `Drawing`: a disc or bar, or a plate with corners in order; a thin plate has a given mass.
+
+    Args:
+        pins: the names of its pins.
+        places: the places of all pins, complex, in the unit of the drawing.
+        extent: the extent of the curve (m).
+        size: the unit of the drawing in m.
+    """
     shape = {"density": DENSITY, "thickness": THICKNESS * extent / size}
     if len(pins) <= 2:
         return {"pins": pins, "width": WIDTH * extent / size, **shape}
@@ -109,14 +116,14 @@ def _link(pins: list[str], places: dict[str, complex], extent: float, size: floa
 
 
 def turns_on_its_branch(mechanism: Mechanism, x: np.ndarray, topology: Topology, wanted: WantedCurve, size: float) -> bool:
-    """Return whether `kinematics` follows a mechanism over a turn, all constraints closed, on the branch of the linkage.
+    """Return True if `kinematics` follows a mechanism over a turn, with all constraints closed, on the branch of the linkage.
 
     Args:
         mechanism: the mechanism of a drawing of the linkage.
         x: the numbers of the linkage.
         topology: its structure.
         wanted: the curve.
-        size: coordinates of pins (m) are no larger.
+        size: an upper bound of the coordinates of pins (m).
     """
     turns = np.linspace(0.0, 1.0, CHECKED_POSITIONS + 1)
     motion = kinematics(mechanism, None, turns / TURNS_PER_SECOND)

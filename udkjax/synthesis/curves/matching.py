@@ -35,7 +35,18 @@ def find_starts(
     geared: bool = False,
     slides: float = 0.0,
 ) -> Linkages:
-    """Return the linkages whose curves are most similar to the target, of `samples` random ones, moved onto it."""
+    """Return the `keep` linkages of `samples` random ones whose curves are most similar to the target, moved onto it.
+
+    Args:
+        wanted: the wanted curve.
+        limits: the limits; linkages whose dyads exceed the cosine are left out.
+        dyads: the number of dyads.
+        samples: the number of random linkages.
+        keep: the largest number of linkages to return.
+        rng: the generator of random numbers.
+        geared: whether linkages have a second crank.
+        slides: the fraction of dyads that have a slide.
+    """
     x, topology = random_linkages(samples, dyads, rng, geared, slides)
     at = positions(x, topology, turn_angles(samples))
     turns = (np.abs(at.cosines) < limits.cosine).all((0, 2))
@@ -55,7 +66,10 @@ def find_starts(
 
 
 def _parts(wanted: WantedCurve) -> list[np.ndarray]:
-    """Return the target sampled at as many points as each part has; an open target runs forth and back, for a whole turn."""
+    """Return the targets to which parts of curves are compared: the wanted curve at the number of points of each part.
+
+    For a whole turn, an open curve runs forth and back.
+    """
     if wanted.is_closed:
         return [resampled(wanted.points, POINTS, True)]
     there = wanted.points
@@ -64,7 +78,7 @@ def _parts(wanted: WantedCurve) -> list[np.ndarray]:
 
 
 def _by_arc_length(pin: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return closed curves (K, T) by points at equal arc lengths (K, POINTS), and their places as fractional indices."""
+    """Return points of closed curves (K, T) at equal arc lengths (K, POINTS), and their fractional indices in the curves."""
     K, T = pin.shape
     closed = np.concatenate([pin, pin[:, :1]], 1)
     way = np.concatenate([np.zeros((K, 1)), np.cumsum(np.abs(np.diff(closed, axis=1)), 1)], 1)
@@ -78,7 +92,7 @@ def _by_arc_length(pin: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _match(curves: np.ndarray, targets: list[np.ndarray]) -> _Matches:
-    """Return the best parts of curves (K, POINTS), over all first points, targets, and both directions."""
+    """Return the part of each curve (K, POINTS) that is most similar to a target, of all first points, targets and directions."""
     K, rows = len(curves), np.arange(len(curves))
     spectrum, twice = np.fft.fft(curves, axis=1), np.concatenate([curves, curves], 1)
     sums = np.concatenate([np.zeros((K, 1)), np.cumsum(twice, 1)], 1)
@@ -103,7 +117,7 @@ def _match(curves: np.ndarray, targets: list[np.ndarray]) -> _Matches:
 
 
 def _moved(x: np.ndarray, topology: Topology, factor: np.ndarray, offset: np.ndarray, start: np.ndarray) -> np.ndarray:
-    """Return linkages moved by p -> factor p + offset, their turn begun at an angle `start` of the crank."""
+    """Return the numbers of linkages moved by p -> factor p + offset, whose turn begins at the angle `start` of the crank."""
     x, size = x.copy(), np.abs(factor)
 
     def move(k: int, a: np.ndarray, b: np.ndarray | float) -> None:

@@ -43,7 +43,7 @@ def mechanisms_for(
     unit: str = "m",
     progress: ProgressOption = None,
 ) -> CurveDesigns:
-    """Find mechanisms with one motor and a pin that draws a curve: their structure and dimensions, without any data.
+    """Return mechanisms with one motor and a pin that draws a curve; structures and dimensions are found without stored data.
 
     Random linkages of one to three dyads that turn are matched with the curve by shape, and the best are improved in lanes by
     Levenberg-Marquardt steps towards a small Chamfer distance, which does not depend on the order of strokes. The best ones grow
@@ -74,7 +74,7 @@ def mechanisms_for(
             the search with the best designs so far.
 
     Returns:
-        `CurveDesigns`, ranked by error and simplicity. Every design turns fully, confirmed by `kinematics` at 720 positions.
+        A `CurveDesigns`, ranked by error and simplicity. Every design turns fully, confirmed by `kinematics` at 720 positions.
 
     Raises:
         ValueError: the curve or a limit is invalid, or the limits contradict each other.
@@ -95,7 +95,10 @@ def mechanisms_for(
 def _run(
     search: CurveSearch, seconds: float, rounds: int | None, error: float | None, begun: float, progress: ProgressOption
 ) -> int:
-    """Run stages until the time is over; return the number of completed rounds."""
+    """Run stages of a search until a design is good enough, or time or rounds are over; return the number of completed rounds.
+
+    `begun` is the CPU time (`time.process_time`) at which the search began; the others are arguments of `mechanisms_for`.
+    """
     done, enough = 0, ENOUGH + 0.5 * search.wanted.length / CHAMFER_POINTS if error is None else error
     try:
         with report_progress(progress, seconds or None, "mechanisms_for") as report:

@@ -31,7 +31,7 @@ Linkages = tuple[np.ndarray, Topology]
 
 
 def turn_angles(K: int) -> np.ndarray:
-    """Return the angles (K, 72) of a turn."""
+    """Return evenly spaced angles of the crank over a turn, the same for K linkages (K, 72)."""
     return np.broadcast_to(np.arange(MATCHED_ANGLES) * (FULL_TURN / MATCHED_ANGLES), (K, MATCHED_ANGLES))
 
 
@@ -64,7 +64,7 @@ def random_linkages(K: int, dyads: int, rng: np.random.Generator, geared: bool =
 
 
 def closing_lengths(x: np.ndarray, topology: Topology, theta: np.ndarray, d: int, rng: np.random.Generator) -> np.ndarray:
-    """Return random lengths (K, 2) of dyad d, with which it closes at all angles (K, T) of the crank."""
+    """Return random numbers `one` and `two` (K, 2) of dyad d, with which it closes at all angles `theta` (K, T) of the crank."""
     k = HEAD + EACH * (d + 1)
     known = np.concatenate([x[:, :k], x[:, -TAIL:]], 1)
     known[:, k - 2 : k] = 1.0
@@ -81,21 +81,21 @@ def closing_lengths(x: np.ndarray, topology: Topology, theta: np.ndarray, d: int
 
 
 def random_forms(shape: tuple[int, ...], slides: float, rng: np.random.Generator) -> np.ndarray:
-    """Return random forms of dyads, of which the share `slides` has a slide; without slides, no random number is drawn."""
+    """Return random forms of dyads, of which the fraction `slides` has a slide; if it is 0, no random number is drawn."""
     if not slides:
         return np.full(shape, PINS)
     return np.where(rng.random(shape) < slides, rng.choice([RAIL, SLIDE], shape), PINS)
 
 
 def link_lengths(x: np.ndarray, topology: Topology, link: np.ndarray) -> np.ndarray:
-    """Return a usual length (K,) of a link of each dyad."""
+    """Return a usual length (K,) of one link of each linkage, whose numbers are `link` (K,)."""
     rows, (dyad, other) = np.arange(len(x)), np.divmod(np.maximum(link - BASE, 0), 2)
     form = topology.form[rows, np.minimum(dyad, topology.dyads - 1)]
     return x[rows, np.minimum(HEAD + EACH * dyad + 4 + np.where(form == PINS, other, form == SLIDE), x.shape[1] - 1)]
 
 
 def random_places(x: np.ndarray, topology: Topology, link: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Return a random place (K, 2) on a link of each linkage, in its frame."""
+    """Return a random place (K, 2) on one link of each linkage, whose numbers are `link` (K,), in the frame of the link."""
     K, length = len(x), link_lengths(x, topology, link)
     between = np.stack([rng.uniform(-0.6, 1.6, K) * length, rng.normal(0.0, 0.5, K) * length], 1)
     about = rng.normal(0.0, np.where(link == 0, 2.0, 0.8)[:, None], (K, 2))
@@ -111,7 +111,7 @@ def grown(
     rng: np.random.Generator,
     slides: float = 0.0,
 ) -> Linkages:
-    """Return `keep` linkages with one more dyad for each of the given ones, the best of `tries`.
+    """Return `keep` linkages with one more dyad for each of the given linkages: the best of `tries` random ones.
 
     The P of the new dyad is the old drawing pin, so that with the new pin at P the curve is the old one; the place of the new pin
     on the new link follows by least squares from the nearest points of curve and target.

@@ -15,10 +15,10 @@ SPACING, SPACED = 1.25, 12  # so is one of at least so many points whose ends ar
 
 
 def read_curve(curve: object, name: str = "curve") -> np.ndarray:
-    """Return the points (n, 2) of a curve (m) without repetitions; `name` is that of the argument.
+    """Return the points (n, 2) of a curve (m) without repetitions of a point; `name` is the argument's name, for messages.
 
     Raises:
-        ValueError: they are not finite points, there are fewer than three, or all coincide, or squares of numbers would overflow.
+        ValueError: the points are not finite, fewer than three, or all coincide, or powers of their extent would overflow.
     """
     require_finite(name, curve)
     points = np.asarray(curve, float)
@@ -71,8 +71,8 @@ class CurveTarget(NamedTuple):
 
     Attributes:
         points: complex points at equal arc lengths (M,).
-        following: the next point of each (M,); that of an open curve's last point is this point.
-        previous: the previous point of each (M,); that of an open curve's first point is this point.
+        following: the next point of each point (M,); the last point of an open curve is followed by itself.
+        previous: the previous point of each point (M,); the first point of an open curve is preceded by itself.
     """
 
     points: np.ndarray
@@ -102,7 +102,7 @@ class WantedCurve:
         self.length = float(np.abs(np.diff(resampled(self.points, CHAMFER_POINTS + 1))).sum())
 
     def target(self, count: int) -> CurveTarget:
-        """Return the curve resampled at `count` points."""
+        """Return the normalized curve resampled at `count` points."""
         z = resampled(self.points, count, self.is_closed)
         following, previous = np.roll(z, -1), np.roll(z, 1)
         if not self.is_closed:
@@ -110,6 +110,9 @@ class WantedCurve:
         return CurveTarget(z, following, previous)
 
     def error(self, pin: np.ndarray) -> float:
-        """Return the Chamfer distance of a path (complex, normalized), of which whole turns are closed, from the curve."""
+        """Return the Chamfer distance of a normalized path, by complex points, from the curve, in RMS radii of the curve.
+
+        If the whole turn draws the curve, the path is closed.
+        """
         path = as_points(pin)
         return chamfer(as_points(resampled(path, CHAMFER_POINTS, self.is_whole)), self.fine)

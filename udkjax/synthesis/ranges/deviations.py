@@ -20,11 +20,11 @@ class Tolerance:
     """The deviation of a number from its nominal value.
 
     Attributes:
-        deviation: the largest deviation, to both sides; or the lower and upper one, such as (-0.03, 0).
-        unit: its unit; by default SI.
+        deviation: the largest deviation to both sides; or the lower and the upper deviation, such as (-0.03, 0).
+        unit: the unit of `deviation`; by default SI.
         distribution: "normal", "uniform" between the limits, or "truncated": normal, without the pieces beyond the limits.
         sigmas: standard deviations from the middle to a limit, if normal or truncated.
-        shared: a name; numbers with the same one deviate together, as holes of one drill jig.
+        shared: a name; numbers with the same name deviate together, as holes made with one drill jig.
     """
 
     deviation: float | tuple[float, float]
@@ -52,7 +52,7 @@ class Tolerance:
         return float(low), float(high)
 
     def middle_and_deviation(self, unit: str) -> tuple[float, float]:
-        """Return the middle of the limits and the standard deviation, in a unit."""
+        """Return the middle of the limits and the standard deviation, in `unit`."""
         factor = conversion_factor(self.unit, unit) if self.unit else 1.0
         low, high = (factor * x for x in self.limits)
         return (low + high) / 2.0, self.spread * (high - low) / 2.0
@@ -69,7 +69,7 @@ class Tolerance:
 
     @property
     def kurtosis(self) -> float:
-        """The mean of u^4: 3 of a normal distribution."""
+        """The mean of u^4, with u the deviation from the middle in standard deviations: 3 for a normal distribution."""
         if self.distribution == "uniform":
             return 1.8
         if self.distribution == "normal":
@@ -79,7 +79,7 @@ class Tolerance:
         return float((3.0 - share * (a**2 + 3.0)) / (1.0 - share) ** 2)
 
     def units(self, normal: Float[np.ndarray, "N"]) -> Float[np.ndarray, "N"]:
-        """Return deviations u of unit variance from numbers with a normal distribution."""
+        """Return deviations of unit variance with this distribution, from numbers with a standard normal distribution."""
         if self.distribution == "normal":
             return normal
         share = ndtr(normal)
@@ -131,7 +131,7 @@ _SIDES = {"h": (-1.0, 0.0), "H": (0.0, 1.0), "js": (-0.5, 0.5), "JS": (-0.5, 0.5
 
 
 def grade(text: str, length: float) -> Tolerance | None:
-    """Return the tolerance of a grade of ISO 286, such as "h9", for a nominal length (m); None if the text is no grade.
+    """Return the tolerance of a grade of ISO 286, such as "h9", for a nominal length (m); None if the text is not a grade.
 
     Raises:
         ValueError: the grade or the length is not in the table.
@@ -160,7 +160,7 @@ def read_tolerance(given: Any, units: str, nominal: float, drawn: Units) -> Tole
 
     Raises:
         ValueError: the text cannot be read, or is a grade of another quantity than a length.
-        TypeError: it is something else.
+        TypeError: `given` is neither a number nor a text nor a `Tolerance`.
     """
     if isinstance(given, Tolerance):
         return given

@@ -138,7 +138,11 @@ class LengthLimits:
 def _with_slopes(
     free: FreeNumbers, pairs: Sequence[tuple[str | None, str]]
 ) -> Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]:
-    """Return the vectors (M, K, 2) between pairs of pins (from the origin: None), and their derivatives by the free numbers."""
+    """Return a function of free numbers (M, F) that returns vectors between pairs of pins and their derivatives.
+
+    The vectors (M, K, 2) are from the first to the second pin of each pair, or from the origin if the first is None; the
+    derivatives by the free numbers are (M, K, 2, F).
+    """
 
     def between(x: Array) -> Array:
         pins = free.moved(x).drawing.pins  # pyright: ignore[reportOptionalMemberAccess]
@@ -165,7 +169,10 @@ def _with_slopes(
 
 
 def read_area(mechanism: Mechanism, pin: str, area: object, problems: list[str]) -> np.ndarray:
-    """Return an area of a pin: a circle (3,) or the corners (k, 2) of a convex polygon; add anything else to the problems."""
+    """Return the area of a pin as an array: a circle (3,) or the corners (k, 2) of a convex polygon.
+
+    If it is neither, or there is no such pin, a message is appended to `problems`.
+    """
     known = {} if mechanism.drawing is None else mechanism.drawing.groups["pin"]
     try:
         array = np.asarray(area, float)
@@ -182,7 +189,7 @@ def read_area(mechanism: Mechanism, pin: str, area: object, problems: list[str])
 
 
 def box_of(area: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the smallest and the largest x and y of an area."""
+    """Return the smallest x, y and the largest x, y (2,) of an area as `read_area` returns it."""
     return (area[:2] - area[2], area[:2] + area[2]) if area.ndim == 1 else (area.min(0), area.max(0))
 
 

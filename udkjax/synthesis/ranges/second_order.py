@@ -20,30 +20,38 @@ STEP = 3.0**0.5  # of differences, in standard deviations
 
 
 class Quadratic(NamedTuple):
-    """Measures G as quadratic functions of the K deviations."""
+    """G measures as quadratic functions of K deviations u: values, first and second derivatives at u = 0."""
 
     value: Float[np.ndarray, "G"]
     slope: Float[np.ndarray, "G K"]
     curvature: Float[np.ndarray, "G K K"]
 
     def __call__(self, u: Float[np.ndarray, "N K"]) -> Float[np.ndarray, "N G"]:
-        """Return the measures at deviations."""
+        """Return the measures at N vectors of deviations."""
         return self.value + u @ self.slope.T + 0.5 * np.einsum("ni,gij,nj->ng", u, self.curvature, u)
 
     @property
     def mean(self) -> Float[np.ndarray, "G"]:
-        """The means."""
+        """The mean of each measure over the deviations."""
         return self.value + 0.5 * np.einsum("gii->g", self.curvature)
 
     def parts(self, kurtosis: Float[np.ndarray, "K"]) -> tuple[Float[np.ndarray, "G K"], Float[np.ndarray, "G K K"]]:
-        """Return the parts of the variances by each deviation alone, and by each pair, symmetric with a zero diagonal."""
+        """Return the parts of each variance due to each deviation alone, and due to each pair, symmetric with a zero diagonal.
+
+        `kurtosis` is the mean of u^4 of each deviation.
+        """
         own = np.einsum("gii->gi", self.curvature)
         pairs = self.curvature**2 * (1.0 - np.eye(self.slope.shape[1]))
         return self.slope**2 + own**2 * (kurtosis - 1.0) / 4.0, pairs
 
 
 def quadratic(function: Callable[[np.ndarray], np.ndarray], count: int) -> Quadratic:
-    """Return the quadratic function with the differences of a function of deviations (N, K)."""
+    """Return the quadratic functions with the same first and second differences as a function at zero deviations.
+
+    Args:
+        function: returns G measures (N, G) at N vectors of deviations (N, K); it is called once.
+        count: the number K of deviations.
+    """
     units, pairs = STEP * np.eye(count), list(combinations(range(count), 2))
     signs = [(1, 1), (1, -1), (-1, 1), (-1, -1)]
     crossed = [a * units[i] + b * units[j] for i, j in pairs for a, b in signs]
