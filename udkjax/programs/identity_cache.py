@@ -137,7 +137,7 @@ class SizedFunction(Protocol[Arguments, Produced_co]):
     def cache_info(self) -> _CacheInfo:
         """Return the hits, misses and size of this function's cache, as functions with `functools.lru_cache` do.
 
-        `maxsize` is the limit of all caches together, in bytes; `currsize` is the number of stored results of this function.
+        `maxsize` is the limit of all caches together, in bytes; the current size counts the results of this function.
         """
         ...
 

@@ -25,10 +25,10 @@ class Body(PrintsLine):
 
     Args:
         mass: in kg, greater than zero.
-        inertia: moment of inertia about the centre of mass, in kg m^2, greater than zero.
-        position: position of the centre of mass (m).
-        angle: angle of the frame, anticlockwise from the x axis (rad).
-        velocity: velocity of the centre of mass (m/s).
+        inertia: about the centre of mass, in kg m^2, greater than zero.
+        position: of the centre of mass (m).
+        angle: of the frame, anticlockwise from the x axis (rad).
+        velocity: of the centre of mass (m/s).
         angular_velocity: in rad/s, anticlockwise positive.
     """
 
