@@ -205,6 +205,13 @@ def test_a_scene_names_the_file_of_an_outline(outline, tmp_path):
     assert sum(x["fill"] == "back" and len(x.get("points", ())) > 12 for x in symbols) == 2
 
 
+def test_numbers_that_are_given_count_more_than_those_of_the_outline(tmp_path):
+    """A measured mass, inertia or centre, as of a link with a motor on it, in the units of the drawing."""
+    given = 'mass = 2.5, inertia = "0.031 kg m2", centre = [30, 2], outline = "arm.dxf"'
+    arm = scene_with(tmp_path, given).bodies["arm"]
+    np.testing.assert_allclose([arm.mass, arm.inertia, *arm.position], [2.5, 0.031, 0.03, 0.002], rtol=1e-12)
+
+
 def test_mistakes_of_named_outlines_are_listed(tmp_path):
     for arm, message in {
         'outline = "arm.dxf"': r'link\[0\] "arm": needs a mass, or a density and a thickness',

@@ -117,7 +117,7 @@ def _with_outline(link: dict[str, Any], file: _File, units: Units, problems: lis
 
 
 def _masses(link: dict[str, Any], outline: Outline, path: str, units: Units, problems: list[str]) -> dict[str, Any]:
-    """Return keys of the table of a link: its mass and inertia, given or exact for its outline, and the centre of the outline.
+    """Return keys of the table of a link: its mass, inertia and centre of mass, given or exact for its outline.
 
     The result is empty if the mass is unknown, which is a problem.
     """
@@ -130,5 +130,9 @@ def _masses(link: dict[str, Any], outline: Outline, path: str, units: Units, pro
         mass = None if len(parts) < len(FROM_AREA) or None in parts else parts[0] * parts[1] * outline.area  # pyright: ignore
     if mass is None or not isinstance(mass, float | int):
         return {}
-    found = {"mass": units.write(mass, "kg"), "inertia": units.write(mass * outline.square_radius, "kg m2")}
-    return found | {"centre": [units.write(float(x), "m") for x in outline.centroid]} | {k: link[k] for k in found if k in link}
+    found = {
+        "mass": units.write(mass, "kg"),
+        "inertia": units.write(mass * outline.square_radius, "kg m2"),
+        "centre": [units.write(float(x), "m") for x in outline.centroid],
+    }
+    return found | {key: link[key] for key in found if key in link}
