@@ -1,6 +1,6 @@
 """Requirements on arguments of public functions, written at the parameter: `rtol: Annotated[NumberLike, NOT_NEGATIVE]`.
 
-None is not checked here: it is accepted where a parameter may be None, and refused elsewhere (udkjax/scene/arguments.py).
+These checks are not applied to None: udkjax/scene/arguments.py refuses None unless the parameter allows it.
 """
 
 import dataclasses
@@ -30,7 +30,7 @@ from udkjax.wording import quote
 
 
 class ArgumentRequirement(NamedTuple):
-    """A requirement on an argument beyond its type: metadata of `Annotated`, which `help` shows by its `text`."""
+    """A requirement on an argument beyond its type, given as metadata of `Annotated`; `help` displays its `text`."""
 
     text: str
     check: ArgumentCheck
@@ -43,7 +43,7 @@ INSTANCE_CHECKS: dict[type, ArgumentCheck] = {}  # a check holds for subclasses,
 
 
 def checks_instances(cls: type) -> Callable[[ArgumentCheck], ArgumentCheck]:
-    """Return a decorator of the check of arguments that are instances of a class."""
+    """Return a decorator that registers a function as the check of arguments that are instances of `cls` or of a subclass."""
 
     def register(check: ArgumentCheck) -> ArgumentCheck:
         INSTANCE_CHECKS[cls] = check
@@ -53,7 +53,7 @@ def checks_instances(cls: type) -> Callable[[ArgumentCheck], ArgumentCheck]:
 
 
 def require_thresholds(name: str, value: Any, given: GivenArguments) -> None:
-    """Require that the numbers of a choice, such as a method or gains, are finite, and not negative."""
+    """Require that the numbers in the fields of a dataclass, such as a method or gains, are finite, and zero or positive."""
     for field in dataclasses.fields(value):
         x = getattr(value, field.name)
         if eqx.is_array(x) or isinstance(x, float):
@@ -61,7 +61,7 @@ def require_thresholds(name: str, value: Any, given: GivenArguments) -> None:
 
 
 def of_kind(condition: str, is_valid: Callable[[Any], bool]) -> ArgumentCheck:
-    """Return a check that an argument satisfies `is_valid`; `condition` describes valid arguments in messages."""
+    """Return a check that an argument satisfies `is_valid`; `condition` completes the message "NAME must ..."."""
 
     def check(name: str, value: Any, given: GivenArguments):
         if not is_valid(value):
@@ -89,7 +89,10 @@ def _require_point(name: str, value: Any, given: GivenArguments) -> None:
 
 
 def require_coordinates(name: str, value: Any, given: GivenArguments, flat: bool = True) -> None:
-    """Require x, y and angle of each body of the mechanism, or their rates: (bodies, 3), or (n,) if `flat`."""
+    """Require finite coordinates x, y, angle, or their rates, of each body of the mechanism: (bodies, 3), or also (n,) if `flat`.
+
+    A system written by the user, whose number of coordinates is not known, requires a vector (n,).
+    """
     names, coordinates = getattr(given["mechanism"], "body_names", ()), array(name, value)
     if not names:  # the number of coordinates of a user-written system is not known
         if coordinates.ndim != 1:
@@ -110,7 +113,10 @@ def _place(names: Sequence[str], index: tuple[int, ...]) -> str:
 
 
 def require_history(name: str, value: Any, given: GivenArguments) -> None:
-    """Require a solution, or any object with times ts (T,) and states q and v (T, bodies, 3) of the mechanism."""
+    """Require a solution, or any object with times ts (T,) and states q and v (T, bodies, 3) of the mechanism.
+
+    For a system written by the user, q and v are (T, n).
+    """
     names = getattr(given["mechanism"], "body_names", ())
     missing = [part for part in ("ts", "q", "v") if not hasattr(value, part)]
     if missing or isclass(value):
@@ -132,7 +138,7 @@ def require_history(name: str, value: Any, given: GivenArguments) -> None:
 
 
 def several(count: int, sign: Sign = "any") -> ArgumentRequirement:
-    """Return the requirement of a list of numbers, each finite and of a sign."""
+    """Return the requirement that an argument consists of `count` finite numbers of the given sign."""
 
     def check(name: str, value: Any, given: GivenArguments):
         if array(name, value).shape != (count,):

@@ -34,7 +34,7 @@ def array_namespace(*numbers: ArrayLike | Sequence[ArrayLike]) -> ModuleType:
 
 
 def is_array(x: object) -> bool:
-    """Return whether a leaf is an array, of JAX or NumPy."""
+    """Return True if an object, such as a leaf of a tree, is an array of JAX or NumPy."""
     return isinstance(x, jax.Array | np.ndarray)
 
 
@@ -44,9 +44,9 @@ def is_traced(tree: Any) -> bool:
 
 
 def without_derivatives(tree: Any) -> Any:
-    """Return a tree without tangents: its numbers are concrete where only derivatives trace them, as in `jax.grad(f)(x)`.
+    """Return a tree without tangents: numbers become concrete where only derivatives trace them, as in `jax.grad(f)(x)`.
 
-    If nothing is traced, it is the tree itself, with what is stored for it.
+    A tree without traced numbers is returned as the same object, with everything that is cached for it.
     """
     if not is_traced(tree):
         return tree
@@ -54,7 +54,7 @@ def without_derivatives(tree: Any) -> Any:
 
 
 def is_within_jit() -> bool:
-    """Return True while a program is traced, in which concrete numbers become constants."""
+    """Return True while a program is traced, as by `jax.jit`: even operations on concrete numbers then become part of it."""
     return isinstance(_evaluated_p.bind(), Tracer)
 
 
@@ -65,16 +65,19 @@ mlir.register_lowering(_evaluated_p, mlir.lower_fun(lambda: jnp.asarray(True), m
 
 
 def library_for(tree: Any) -> ModuleType:
-    """Return jax.numpy if a number in a tree is traced, else NumPy: JAX would compile a program for each operation."""
+    """Return jax.numpy if a number in a tree is traced, else NumPy, since JAX would compile a program for each operation."""
     return jnp if is_traced(tree) else np
 
 
 def stored(x: Any) -> Any:
-    """Convert a NumPy array, which must not change any more, to a JAX array; return anything else unchanged."""
+    """Convert a NumPy array to a JAX array, which may share its memory, so that the NumPy array must not be changed afterwards.
+
+    Anything else is returned unchanged.
+    """
     return jax.device_put(x) if isinstance(x, np.ndarray | np.generic) else x
 
 
-# Without `jit`, as `jax.disable_jit` has it, they convert.
+# Under `jax.disable_jit` they convert without a compiled program.
 _put_together, _put_alone = jax.jit(lambda *arrays: [jnp.asarray(x) for x in arrays]), jax.jit(jnp.asarray)
 _WORTH_A_PROGRAM = 60  # calls after which a program is compiled, in 15 ms; it saves 0.3 ms per call
 _FEW_NUMBERS = 2**16  # up to which copying them into one vector takes less time than passing arrays one by one
@@ -82,12 +85,15 @@ _calls: Counter[tuple[tuple[int, ...], ...]] = Counter()  # number of calls by t
 
 
 def by_numpy(x: Any) -> Any:
-    """Return a number as a NumPy array unless it is traced or absent: results of concrete numbers stay concrete."""
+    """Return a number as a NumPy array, so that results stay concrete; return None and traced numbers unchanged."""
     return x if x is None or isinstance(x, Tracer) else np.asarray(x)
 
 
 def put_arrays(arrays: Any) -> Any:
-    """Convert a tree of NumPy arrays and numbers to JAX arrays."""
+    """Return a tree of NumPy arrays and numbers as a tree of JAX arrays.
+
+    A compiled program converts the trees whose shapes occur often, which takes less time than one transfer per array.
+    """
     leaves, tree = jax.tree.flatten(arrays)
     _calls[shapes := tuple(map(np.shape, leaves))] += 1
     if _calls[shapes] <= _WORTH_A_PROGRAM or jax.config.jax_debug_nans or jax.config.jax_debug_infs:
@@ -102,7 +108,10 @@ def put_arrays(arrays: Any) -> Any:
 
 @partial(jax.jit, static_argnums=1)
 def _unpacked(words: Float[Array, "N"], kinds: Sequence[tuple[tuple[int, ...], np.dtype]]) -> list[Array]:
-    """Return arrays from one vector of 64-bit words, since each argument takes some 5 us, and 10 us on a graphics card."""
+    """Return the arrays of given shapes and types (`kinds`) that are stored one after another in a vector of 64-bit words.
+
+    Each argument of a program takes some 5 us, and 10 us on a graphics card; this vector is a single argument.
+    """
     ends = np.cumsum([math.prod(shape) for shape, _ in kinds])[:-1]
     parts = zip(jnp.split(words, ends), kinds, strict=True)
     return [
@@ -140,7 +149,7 @@ def solve_each(A: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 class TreeMethod:
-    """A method that is looked up on an instance as a tree."""
+    """A descriptor of a method: on an instance, it returns the bound method as a tree (`Partial`) that contains the instance."""
 
     def __init__(self, function: FunctionType):
         self.function = function
@@ -155,10 +164,10 @@ class TreeMethod:
 
 
 class QuickMethods(eqx.Module):
-    """A module whose numbers and methods are looked up in the same time however many numbers it has.
+    """An Equinox module in which looking up a field or a method takes the same time for any number of array leaves.
 
-    Its methods are trees, as those of every Equinox module, so that `jax.jit(module.method)` traces its numbers. Equinox looks at
-    each attribute for that, in Python, and makes methods with a check that visits all leaves each time.
+    Methods are trees, as in every Equinox module, so that `jax.jit(module.method)` traces the module's numbers. Equinox examines
+    each attribute for that in Python when it is looked up, and makes methods with a check that visits all leaves each time.
     """
 
     if not TYPE_CHECKING:
@@ -178,12 +187,15 @@ _FLOAT64, _FLOAT32 = np.dtype(np.float64), np.dtype(np.float32)
 
 
 def float_type() -> np.dtype:
-    """Return the type that JAX gives to Python's floats, as `jax.numpy.result_type(float)` does in fifty times the time."""
+    """Return the dtype that JAX gives to Python floats; `jax.numpy.result_type(float)` takes fifty times as long to return it."""
     return _FLOAT64 if jax.config.jax_enable_x64 else _FLOAT32
 
 
 def number(value: Numbers) -> Float[Array, "..."]:
-    """Convert a number to an array leaf: a Python float as a field would be static, and each new value would be compiled."""
+    """Return a number, or an array of numbers, as a JAX array of the type `float_type()`, to be stored as a field of a module.
+
+    A Python float in a field would be static: each new value would be compiled. A JAX array of this type is returned as it is.
+    """
     dtype = float_type()
     if isinstance(value, jax.Array) and value.dtype == dtype and not value.weak_type:  # the same object: a leaf stays this leaf
         return value
@@ -200,7 +212,7 @@ def number(value: Numbers) -> Float[Array, "..."]:
 
 
 def optional_number(value: Numbers | None) -> Float[Array, "..."] | None:
-    """Like `number`, but None, an absent number, stays None."""
+    """Convert a number as `number` does; return None, an absent number, as it is."""
     return None if value is None else number(value)
 
 

@@ -1,4 +1,4 @@
-"""The devices on which JAX computes by default, and the host among them."""
+"""The devices on which JAX computes by default, and the CPU of the host."""
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
@@ -24,7 +24,10 @@ def default_devices() -> list[Any]:
 
 
 def host_device() -> Any:
-    """Return the CPU device if JAX computes on other devices by default; else None, as where `JAX_PLATFORMS` excludes the CPU."""
+    """Return the CPU device if JAX computes on other devices by default.
+
+    Return None if it computes on the CPU by default, or if `JAX_PLATFORMS` excludes the CPU.
+    """
     return None if default_devices()[0].platform == "cpu" else cpu_device()
 
 
@@ -37,16 +40,17 @@ def cpu_device() -> Any:
 
 
 def computing_on_host() -> AbstractContextManager[Any]:
-    """Return a context in which JAX computes on the host by default, if it has a CPU device."""
+    """Return a context in which JAX computes on the CPU by default; without a CPU device, the context changes nothing."""
     host = host_device()
     return nullcontext() if host is None else jax.default_device(host)
 
 
 def on_host(program: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
-    """Return a compiled function that runs on the host when it is called outside of other programs.
+    """Return a function that runs a compiled function on the host's CPU, unless it is called while another program is traced.
 
-    It is for programs with many small operations: a graphics card needs microseconds to begin each of them, and JAX ten times as
-    long to compile them. Arrays that are committed to a device are computed there. Results are on the default device.
+    It is meant for programs with many small operations: a graphics card needs microseconds to begin each operation, and JAX takes
+    ten times as long to compile for it. If an argument is committed to a device, the program runs on that device. The results are
+    moved to the default device.
     """
 
     @wraps(program)

@@ -48,13 +48,13 @@ STUDIO = "starlette", "uvicorn", "tomlkit"  # the packages that serve the studio
 
 
 class MissingExtraError(ModuleNotFoundError):
-    """A package is missing that an extra of udkjax installs."""
+    """A package that an extra of udkjax installs is missing."""
 
 
 class OptionalImport:
-    """Inside `with OptionalImport():`, a missing package of an extra raises an error that explains how to install it.
+    """A context for imports of optional packages: if a package of an extra is missing, the error explains how to install it.
 
-    Other import errors are passed on unchanged.
+    The error is a `MissingExtraError`; other import errors are passed on unchanged.
     """
 
     def __enter__(self) -> None:
@@ -75,7 +75,7 @@ def require(*packages: str) -> None:
 
 
 def cure(missing: Sequence[str]) -> str:
-    """Return the command that installs missing packages, by as few extras as bring them all."""
+    """Return a message that names missing packages, with the command that installs them by as few extras as possible."""
     extras = {EXTRAS[package] for package in missing}
     brought = {other for extra in extras for other in BRINGS.get(extra, ())}
     names = ",".join(sorted(extras - brought))

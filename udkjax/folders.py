@@ -1,4 +1,4 @@
-"""Folders that this process may write, and those that it may trust."""
+"""Checks of folders: write access of this process, and protection against other users."""
 
 import os
 import stat
@@ -6,7 +6,7 @@ from pathlib import Path
 
 
 def is_writable(folder: Path) -> bool:
-    """Return whether files can be written into a folder, which is created for this user alone if necessary."""
+    """Return True if this process can write files into a folder; a missing folder is created first, for this user alone."""
     try:
         folder.mkdir(0o700, parents=True, exist_ok=True)
     except OSError:
@@ -15,7 +15,7 @@ def is_writable(folder: Path) -> bool:
 
 
 def refusal(folder: Path) -> str | None:
-    """Return why code in a folder must not be executed; None if it may be, or if there is no such folder."""
+    """Return the reason not to execute code in a folder, as a clause for messages; None if there is none, or no such folder."""
     try:
         return distrust(folder.stat())
     except OSError:
@@ -23,7 +23,10 @@ def refusal(folder: Path) -> str | None:
 
 
 def distrust(status: os.stat_result) -> str | None:
-    """Return why other users may have written a file or folder; None if they cannot."""
+    """Return the reason to assume that another user may have written a file or folder with this status, as a clause for messages.
+
+    Return None if only this user and root can write it, and always on Windows.
+    """
     if not hasattr(os, "getuid"):  # Windows: the user's own folders are closed to others by default
         return None
     if status.st_uid not in (os.getuid(), 0):

@@ -10,10 +10,10 @@ from typing import Any
 
 
 def lazy_names(package: str) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
-    """Return `__getattr__`, `__dir__` and `__all__` of a package, from the imports of its stub, which editors read as well.
+    """Return `__getattr__`, `__dir__` and `__all__` for a package, with the names that its stub `__init__.pyi` imports.
 
-    Names of the stub take precedence over modules of the same name: `from udkjax.integrate import simulate` is the function,
-    even if the module `udkjax.integrate.simulate` is already loaded.
+    Editors read this stub, too. Its names take precedence over modules of the same name: `from udkjax.integrate import simulate`
+    is the function, even if the module `udkjax.integrate.simulate` is already loaded.
     """
     stub = (pkgutil.get_data(package, "__init__.pyi") or b"").decode()
     homes = {name: module for module, name in re.findall(r"^from (\S+) import (\w+) as", stub, re.MULTILINE)}

@@ -25,9 +25,9 @@ Plain = bool | int | float | complex | np.ndarray | np.generic
 
 
 class PrintedTable(NamedTuple):
-    """A title, the names of the columns, and rows of cells. Without names of columns, the first column names the rows.
+    """A table to print: a title, the names of the columns (`heads`), and rows of cells.
 
-    Remarks, one sentence each, follow the rows.
+    Without names of columns, the first cell of each row is its name. Remarks, one sentence each, follow the rows.
     """
 
     title: str
@@ -78,12 +78,15 @@ def _shorten(text: str) -> str:
 
 
 def units(**by_field: str) -> Mapping[str, str]:
-    """Return the units of fields by name."""
+    """Return the given units by the name of the field, as a mapping that cannot be changed."""
     return MappingProxyType(by_field)
 
 
 def has_numbers(value: object) -> bool:
-    """Return True if all numbers have values, so that no number is traced or only a shape."""
+    """Return True if all leaves of an object are strings or numbers whose values can be read.
+
+    Traced numbers, mere shapes, deleted arrays, and arrays of other processes have no such values.
+    """
     return all(isinstance(leaf, Plain | str) or _is_stored(leaf) for leaf in _leaves(value))
 
 
@@ -98,7 +101,7 @@ def _is_stored(leaf: object) -> bool:
 
 
 def format_number(value: Any, unit: str = "", scale: float = 0.0) -> str:
-    """Return one number with six digits and its unit; 0 if it is a rounding error relative to `scale`."""
+    """Return one number with six digits and its unit; a number that is a rounding error relative to `scale` becomes 0."""
     number = complex(value) if np.iscomplexobj(value) else float(value)
     text = f"{0.0 if abs(number) <= PRINTED_AS_ZERO * scale else number:.{DIGITS}g}"
     return f"{text} {unit}" if unit else text
@@ -175,7 +178,10 @@ def format_field(value: Any, unit: str = "") -> str:
 
 
 def one_line(record: Any) -> str:
-    """Return a record as a Python expression on one line, long arrays by their shape and range."""
+    """Return a record on one line, in the form of a Python expression; a long array is represented by its shape and range.
+
+    Fields with the value None are left out.
+    """
     shown = [f"{name}={_literal(value)}" for name, value in fields_of(record).items() if value is not None]
     text = f"{type(record).__name__}({', '.join(shown)})"
     return text if len(text) <= MOST_LINE else text[: MOST_LINE - 5] + " ...)"
@@ -186,7 +192,7 @@ def _literal(value: Any) -> str:
 
 
 class PrintsLine(QuickMethods):
-    """A module that prints as a Python expression."""
+    """A module that prints as a Python expression on one line."""
 
     def __repr__(self) -> str:
         return one_line(self)
@@ -234,7 +240,10 @@ Class = TypeVar("Class", bound=type)
 
 
 def prints_table(cls: Class) -> Class:
-    """Decorate a named tuple that has a method `_table` or `_units`, so that it prints as a `PrintsTable` does."""
+    """Make the instances of a named tuple print as a `PrintsTable` does, and return the class; a decorator.
+
+    The class has a method `_table`, or the units of its fields, `_units`.
+    """
     setattr(cls, "__repr__", lambda self: text_table(_table_of(self)))  # noqa: B010  # no declared attribute of `type`
     setattr(cls, "_repr_html_", lambda self: html_table(_table_of(self)))  # noqa: B010
     return cls

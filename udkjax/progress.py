@@ -25,7 +25,7 @@ class Progress:
         done: amount done, in the units of `total`.
         total: amount to do; None if unknown.
         seconds: time since the computation began (s).
-        message: a description of its state.
+        message: a description of the state of the computation; "" if there is none.
     """
 
     what: str
@@ -49,7 +49,10 @@ ProgressOption = TypeAliasType("ProgressOption", Callable[[Progress], object] | 
 
 
 class Report:
-    """The function that a computation calls, `report(done, message)`; None for `done` leaves it unchanged."""
+    """The function `report(done, message)` that a computation calls to report its progress.
+
+    `done` is the amount done so far; with None, it stays as it was.
+    """
 
     def __init__(self, show: Callable[[Progress], object], what: str, total: float | None):
         self.show, self.begun = show, time.monotonic()

@@ -45,7 +45,11 @@ def describe(value: Any) -> str:
 
 
 def array(name: str, value: Any) -> "np.ndarray | Tracer":
-    """Return real numbers as an array without derivatives; for anything else raise a `TypeError` that names the argument."""
+    """Return an argument as an array of real numbers without derivatives: of NumPy, or a tracer if numbers are traced.
+
+    Raises:
+        ArgumentTypeError: the argument is anything else; the message gives its name.
+    """
     if isinstance(value, Tracer):
         numbers: Any = without_derivatives(value)
         numbers = numbers if isinstance(numbers, Tracer) else np.asarray(numbers)  # derivatives of Python's numbers
@@ -67,7 +71,10 @@ def array(name: str, value: Any) -> "np.ndarray | Tracer":
 
 
 def require_number(name: str, value: Any, sign: Sign = "any", infinite: bool = False, given: GivenArguments = NOTHING) -> None:
-    """Require one real number of a sign, finite unless `infinite`; of a traced number, only shape and dtype are checked."""
+    """Require one real number of a sign; it must be finite unless `infinite`.
+
+    Of a traced number, only shape and dtype are checked.
+    """
     number = array(name, value)
     if number.shape != ():
         cure = "a batch is for jax.vmap, or for udk.sweep"
@@ -88,7 +95,7 @@ def require_numbers(name: str, value: Any, shape: tuple[int, ...], meaning: str)
 
 
 def require_text(name: str, value: Any, may_be_empty: bool = False) -> None:
-    """Require a string, which is not empty unless `may_be_empty`."""
+    """Require a string; an empty string is allowed only if `may_be_empty`."""
     if not isinstance(value, str):
         raise ArgumentTypeError(f"{name} must be a string, {describe(value)}")
     if not value and not may_be_empty:
@@ -96,7 +103,7 @@ def require_text(name: str, value: Any, may_be_empty: bool = False) -> None:
 
 
 def are_names(value: Any) -> bool:
-    """Return True for a list of strings."""
+    """Return True for a list, or any other sequence, of strings; False for a single string."""
     return isinstance(value, Sequence) and not isinstance(value, str) and all(isinstance(name, str) for name in value)
 
 
@@ -121,13 +128,13 @@ def require_name_or_names(name: str, value: Any, given: GivenArguments = NOTHING
 
 
 def require_choice(name: str, value: Any, choices: Sequence[str]) -> None:
-    """Require one of several strings."""
+    """Require a string that is one of the choices."""
     if not isinstance(value, str) or value not in choices:
         raise ArgumentError(f"{name} must be one of {', '.join(choices)}, {describe(value)}")
 
 
 def require_function(name: str, value: Any, arguments: str) -> None:
-    """Require a function, or a callable object; a class is neither."""
+    """Require a function or another callable object, but not a class; `arguments` describes its arguments, for messages."""
     if not callable(value) or isclass(value):
         raise ArgumentTypeError(f"{name} must be a function {arguments}, {describe(value)}")
 
@@ -142,7 +149,10 @@ def require_count(name: str, value: Any, least: float = 1, given: GivenArguments
 
 
 def require_finite(name: str, value: Any, place: Callable[..., str] = lambda *index: "", given: GivenArguments = NOTHING) -> None:
-    """Require finite numbers if they are concrete; `place` describes an entry in words."""
+    """Require that numbers are finite; traced numbers are not checked.
+
+    `place` returns a description of the entry with given indices, which follows the entry's value in the message.
+    """
     numbers = array(name, value)
     if isinstance(numbers, Tracer) or (finite := np.isfinite(numbers)).all():
         return
@@ -173,12 +183,12 @@ def require_output_times(name: str, value: Any, given: GivenArguments = NOTHING)
 
 
 def concrete_only(instead: str = "") -> Callable[[Callable[Arguments, Result]], Callable[Arguments, Result]]:
-    """Return a decorator of functions that compute with NumPy; an argument with a traced number raises a `TypeError`.
+    """Return a decorator of functions that compute with NumPy; an argument with a traced number raises `ArgumentTypeError`.
 
-    Within the trace of another function, they compute with concrete numbers as outside.
+    While another function is traced, a decorated function still computes concrete results from concrete numbers.
 
     Args:
-        instead: The functions to use under jit and vmap, for the message; empty: there are none.
+        instead: names of the functions to use under jit and vmap, for the message; "" if there are none.
     """
 
     def decorate(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:

@@ -1,4 +1,4 @@
-"""Places of texts in a picture: one after another, each where it covers least of other texts and of lines."""
+"""Places for texts in a picture, chosen one after another, so that each covers least of earlier texts and of lines."""
 
 from collections.abc import Callable, Sequence
 from typing import TypeVar
@@ -20,14 +20,14 @@ OUTSIDE, ON_TEXT, ON_LINE = 4.0, 2.0, 1.0  # costs of a tested place outside the
 
 
 class TextPlaces:
-    """The texts of a picture so far, and its lines.
+    """The texts placed in a picture so far, and the lines of the picture.
 
     Args:
-        width: of the picture, in its units, from zero.
-        height: of the picture.
+        width: width of the picture, in any unit of length; coordinates begin at zero.
+        height: height of the picture, in the same unit as all further lengths.
         size: height of letters.
         boxes: boxes that texts keep clear.
-        lines: lines that texts keep clear.
+        lines: lines, from a start to an end, that texts keep clear.
     """
 
     def __init__(self, width: float, height: float, size: float, boxes: Sequence[Box] = (), lines: Sequence[Segment] = ()):
@@ -39,7 +39,7 @@ class TextPlaces:
         return WIDE * self.size * len(words)
 
     def level(self, middle: PagePoint, words: str) -> Box:
-        """Return the box of a text that is written along x."""
+        """Return the box of a text that is written along x around a middle."""
         return middle, np.array([self.width(words) / 2, 0.0]), np.array([0.0, self.size / 2])
 
     def cheapest(
@@ -49,25 +49,31 @@ class TextPlaces:
         own: Segment | None = None,
         more: Callable[[T], Sequence[PagePoint]] = lambda _: (),
     ) -> T:
-        """Return the first choice whose text covers least.
+        """Return the choice whose text covers least; of several such choices, the first.
 
         Args:
             choices: choices, the best first.
-            box: the box of the text of a choice.
-            own: a line that the text may cover.
-            more: further places of a choice that should be in the picture.
+            box: function that returns the box of the text of a choice.
+            own: a line that the text may cover; None if there is none.
+            more: function that returns further points of a choice that should lie within the picture.
         """
         costs = [self._cost(box(choice), own, more(choice)) for choice in choices]
         return choices[int(np.argmin(costs))]
 
     def put(self, choices: Sequence[PagePoint], words: str) -> PagePoint:
-        """Return the first of several middles of a text along x at which it covers least, and keep its box clear."""
+        """Return the middle, of several choices, at which a text along x covers least, and keep its box clear of later texts."""
         found = self.cheapest(choices, lambda middle: self.level(middle, words))
         self.boxes.append(self.level(found, words))
         return found
 
     def put_around(self, place: PagePoint, words: str, unit: float = 1.0) -> PagePoint:
-        """Return the middle of a name around a pin, with shifts in a unit of length, and keep its box clear."""
+        """Return the middle of the name of a pin, near the pin, and keep the name's box clear of later texts.
+
+        Args:
+            place: the pin.
+            words: the name.
+            unit: unit of the shifts in `AROUND`, in the unit of the picture.
+        """
         wide = self.width(words)
         shifts = [((0.5 - share) * wide + dx * unit, dy * unit) for dx, dy, share in AROUND]
         return self.put([place + np.array(shift) for shift in shifts], words)

@@ -15,7 +15,11 @@ def cores() -> int:
 
 
 def thread_limit() -> int | None:
-    """Return the value of `UDKJAX_THREADS`; None if it is not set."""
+    """Return the value of `UDKJAX_THREADS`; None if it is not set.
+
+    Raises:
+        ArgumentError: the value is not a positive whole number.
+    """
     text = os.environ.get(SETTING, "").strip()
     if not text:
         return None
@@ -32,5 +36,5 @@ def thread_count() -> int:
 
 @cache
 def shared_threads() -> ThreadPoolExecutor:
-    """Return the threads that calls of machine code share, as starting a thread takes longer than short runs."""
+    """Return the pool of threads that all calls of machine code share, since starting a thread takes longer than a short run."""
     return ThreadPoolExecutor(cores())

@@ -10,7 +10,7 @@ MOST_LISTED = 8  # names listed in one sentence
 
 
 def suggestion(name: object, choices: Iterable[str]) -> str:
-    """Return '; did you mean "..."?' if one of the choices is similar, else an empty string."""
+    """Return '; did you mean "..."?' with the choice that is most similar to a name; "" if none is similar."""
     if not isinstance(name, str):
         return ""
     lowered = {choice.lower(): choice for choice in choices}
@@ -31,7 +31,7 @@ def quote(name: str) -> str:
 
 
 def abbreviate(value: object) -> str:
-    """Return a value as text for a message: as in a TOML file, at most `LONGEST_QUOTE` long."""
+    """Return a value as text for a message, written as in a TOML file, of at most `LONGEST_QUOTE` characters."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, str):
@@ -49,7 +49,7 @@ def plural(count: int, noun: str) -> str:
 
 
 def join_names(names: Sequence[str]) -> str:
-    """Join names for a sentence: "a, b and c"."""
+    """Join names for a sentence: "a, b and c"; of more than `MOST_LISTED` names, the others are only counted."""
     if len(names) > MOST_LISTED:
         return f"{', '.join(names[:MOST_LISTED])} and {len(names) - MOST_LISTED} more"
     return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
@@ -61,7 +61,7 @@ def article(noun: str) -> str:
 
 
 def numbered(title: str, texts: Sequence[str]) -> dict[str, str]:
-    """Return texts by title, numbered if there is more than one."""
+    """Return texts by title; if there are several, the titles are numbered: "title 1", "title 2"."""
     return {title if len(texts) == 1 else f"{title} {k + 1}": text for k, text in enumerate(texts)}
 
 

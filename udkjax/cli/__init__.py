@@ -59,7 +59,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def command(name: str) -> Callable:
-    """Return the function of a command."""
+    """Return the function of the command with this name, and import its module."""
     return getattr(import_module(f"udkjax.cli.{COMMANDS[name]}.{name}"), name)
 
 

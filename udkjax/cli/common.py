@@ -59,7 +59,13 @@ def parse_and_run(commands: Mapping[str, Callable[..., None]], arguments: list[s
 
 
 def load(scene: Path, leave_out: Sequence[str] = (), key: str | None = None) -> tuple["Mechanism", str]:
-    """Read a scene and its text, or make one of `udkjax.library` if no file has this name; for the options see `read_mjcf`."""
+    """Return a mechanism and the text of its scene; exit with a message if the file cannot be read.
+
+    Args:
+        scene: the file; or the name of a function of `udkjax.library`, if no file has this name.
+        leave_out: elements that may be left out of an MJCF model (`read_mjcf`).
+        key: keyframe of an MJCF model that gives the initial state; None for none.
+    """
     import udkjax as udk
 
     try:
@@ -130,7 +136,7 @@ def channels_of(mech: "Mechanism", names: Sequence[str]) -> "list[Channel]":
 
 
 def measure_channels(mech: "Mechanism", motion: "StateHistory", channels: "Sequence[Channel]") -> "Columns":
-    """Return the values of channels along a motion."""
+    """Return the values of channels along a motion, with their unit, by the name of the channel."""
     import numpy as np
 
     from udkjax.positions.assembling.channel_values import measure
@@ -143,7 +149,7 @@ def measure_channels(mech: "Mechanism", motion: "StateHistory", channels: "Seque
 
 
 def choose_driver(mech: "Mechanism", given: str | None) -> str:
-    """Return the given driver, or the scene's only one; exit with a message if it has several drivers or none."""
+    """Return the given driver, by default the scene's only one; exit with a message if the scene has several drivers or none."""
     if given is not None:
         return given
     from udkjax.positions.following.drive import only_driver

@@ -23,7 +23,7 @@ COLUMN_NAMES = {"q": ("x", "y", "angle"), "v": ("vx", "vy", "omega"), "a": ("ax"
 
 
 def check_target(out: Path | None, kinds: Sequence[str] = DATASET_SUFFIXES, option: str = "--out") -> None:
-    """Exit if the suffix of a file is unknown, or its folder does not exist."""
+    """Exit with a message if the suffix of a file to write is not in `kinds`, or its folder does not exist; None is accepted."""
     if out is None:
         return
     if out.suffix.lower() not in kinds:
@@ -33,7 +33,7 @@ def check_target(out: Path | None, kinds: Sequence[str] = DATASET_SUFFIXES, opti
 
 
 def load_to_write(scene: Path, out: Path | None, plot: Path | None = None) -> tuple["Mechanism", str]:
-    """Return a scene and its text; exit if the output files cannot be written."""
+    """Return a scene and its text; exit with a message if the output files `out` and `plot` cannot be written."""
     check_target(out)
     check_target(plot, PICTURE_SUFFIXES, "--plot")
     require(*(NETCDF if out else ()), *(["matplotlib"] if plot else ()))
@@ -41,7 +41,7 @@ def load_to_write(scene: Path, out: Path | None, plot: Path | None = None) -> tu
 
 
 def check_folder(out: Path) -> None:
-    """Exit if a folder cannot be created, or is named like a file."""
+    """Exit with a message if a folder to write cannot be created, or is named like a file."""
     if out.exists() and not out.is_dir():
         refuse(f"--out {out} is not a folder")
     if not out.exists() and out.suffix.lower() in FILE_SUFFIXES:
@@ -57,7 +57,15 @@ def write(
     coordinates: Mapping[str, "Numbers"],
     settings: Mapping[str, object],
 ) -> None:
-    """Write variables (dimensions, values, unit) with the scene, settings and versions to a file, unless `out` is None."""
+    """Write variables and coordinates with the scene, settings and versions to a file in the format given by its suffix.
+
+    Args:
+        out: the file; None to write nothing.
+        scene: text of the scene.
+        variables: dimensions, values and unit of each variable, by name.
+        coordinates: values along dimensions, by dimension.
+        settings: settings of the command by name; those with the value None are left out.
+    """
     if out is None:
         return
     from udkjax.integrate.solution import versions
@@ -75,7 +83,7 @@ def write(
 
 
 def save(data: "xarray.Dataset", out: Path) -> None:
-    """Write a dataset in the format given by the suffix.
+    """Write a dataset in the format given by the suffix of the file.
 
     A .csv contains only the numbers, one row per entry of the first dimension; the other formats contain the attributes, too.
     """
@@ -101,7 +109,7 @@ def save(data: "xarray.Dataset", out: Path) -> None:
 
 
 def _columns(data: "xarray.Dataset") -> "Iterator[tuple[str, np.ndarray]]":
-    """Iterate over the columns of a table: headings, and values along the first dimension."""
+    """Yield the columns of a table, each a heading and its values along the first dimension, from a dataset."""
     import numpy as np
 
     first_dim = str(next(iter(data.data_vars.values())).dims[0])

@@ -20,25 +20,28 @@ def say(text: str) -> None:
 
 
 def refuse(problem: object) -> NoReturn:
-    """Print the mistake in the input, and exit."""
+    """Print the mistake in the input, and exit with the code `BAD_INPUT`."""
     say(str(problem))
     sys.exit(BAD_INPUT)
 
 
 def fail(problem: object, code: int = BAD_RUN) -> NoReturn:
-    """Print the cause of a failed run, and exit."""
+    """Print the cause of a failed run, and exit with a code."""
     say(str(problem))
     sys.exit(code)
 
 
 def _show_warning(message: Warning | str, category: type[Warning], *place: object) -> None:
-    """Print a warning without its place in the code; with its category if it is not from udkjax."""
+    """Print a warning, preceded by its category if it is not from udkjax, without the line of code that issued it."""
     say(f"{message}" if category.__module__.startswith("udkjax.") else f"{category.__name__}: {message}")
 
 
 @contextmanager
 def exit_codes() -> Iterator[None]:
-    """Turn exceptions and warnings of a command into a line on stderr and an exit code; bugs keep their traceback."""
+    """Return a context in which an exception of a command becomes a message on stderr and an exit code, and a warning a message.
+
+    Defects of the package keep their traceback.
+    """
     try:
         with warnings.catch_warnings():
             warnings.showwarning = _show_warning

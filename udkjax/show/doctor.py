@@ -25,7 +25,10 @@ FLAGS = ("JAX_", "UDKJAX_", "XLA_", "CUDA_VISIBLE_DEVICES", "OMP_NUM_THREADS")
 
 
 def facts(run: Callable[..., Solution] = simulate) -> dict[str, Any]:
-    """Return versions, devices, precision, engine, cache and advice, by names that scripts can rely on."""
+    """Return versions, devices, precision, engine, cache and advice, by names that scripts can rely on.
+
+    `run` is the function that `engine_here` tries.
+    """
     folder, sizes = cache_folder(), [size for _, size, _ in cached_files()]
     engine, reason = engine_here(run)
     return {
@@ -51,7 +54,10 @@ def facts(run: Callable[..., Solution] = simulate) -> dict[str, Any]:
 
 
 def engine_here(run: Callable[..., Solution] = simulate) -> tuple[str, str]:
-    """Run a small simulation; return its engine, "native", "diffrax", "jax" or "none", and the reason."""
+    """Run a small simulation by the function `run`; return its engine, "native", "diffrax", "jax" or "none", and the reason.
+
+    The engine is "none" if the simulation fails.
+    """
     try:
         solution = run(double_pendulum(), np.array([0.0, 0.1]))
     except Exception as error:
@@ -61,7 +67,7 @@ def engine_here(run: Callable[..., Solution] = simulate) -> tuple[str, str]:
 
 
 def summary(facts_by_name: dict[str, Any]) -> str:
-    """Describe the findings of `facts`."""
+    """Return the result of `facts` as a table of text, followed by the advice."""
     cached = f"{facts_by_name['cached_programs']} in {facts_by_name['cache']}, {facts_by_name['cached_bytes'] / 2**20:.1f} MiB"
     if facts_by_name["cache"] is None:
         cached = "nothing, because " + (

@@ -19,7 +19,14 @@ with OptionalImport():
 
 
 def driven_figure(mech: Mechanism, motion: Kinematics, along: Float[np.ndarray, "T"], label: str) -> Figure:
-    """Draw the poses of a mechanism, and its angles along the shown values of a driver; at one value, the pose alone."""
+    """Return a figure with poses of a mechanism, and with the angles of its bodies along the values of a driver.
+
+    Args:
+        mech: the mechanism.
+        motion: its positions at the values of the driver.
+        along: the values of the driver as shown; if there is a single value, its pose is drawn alone.
+        label: the driver, with the unit of these values.
+    """
     q, is_alone = np.asarray(motion.q), len(along) == 1
     figure = Figure(figsize=(6 if is_alone else 10, 4.6), layout="constrained")
     scene, *angles = np.ravel(figure.subplots(1, 1 if is_alone else 2))
@@ -33,7 +40,7 @@ def driven_figure(mech: Mechanism, motion: Kinematics, along: Float[np.ndarray, 
 
 
 def draw_channels(axes: Axes, x: ArrayLike, channels: Mapping[str, Float[ArrayLike, "T"]], unit: str = "") -> Axes:
-    """Draw quantities with the same unit, by name, over time or over the values of a driver."""
+    """Draw quantities with the same unit, by name, over x, such as time or the values of a driver; return the axes."""
     for k, (name, values) in enumerate(channels.items()):
         axes.plot(np.asarray(x), np.asarray(values), DASHES[k % 4], color=COLOURS[k % len(COLOURS)], lw=1.3, label=name)
     axes.set(ylabel=unit)
@@ -44,7 +51,7 @@ def draw_channels(axes: Axes, x: ArrayLike, channels: Mapping[str, Float[ArrayLi
 def channels_figure(
     x: ArrayLike, channels: Mapping[str, tuple[ArrayLike, str]], label: str = "time (s)", title: str = ""
 ) -> Figure:
-    """Draw quantities (values and unit, by name), with one panel for each unit."""
+    """Return a figure of quantities (values and unit, by name) over x, with one panel for each unit; `label` describes x."""
     kinds = list(dict.fromkeys(unit for _, unit in channels.values()))
     figure = Figure(figsize=(8, 1.2 + 2.2 * len(kinds)), layout="constrained")
     panels = np.ravel(figure.subplots(len(kinds), 1, sharex=True))
@@ -63,7 +70,7 @@ def _tick_turns(axes: Axes, label: str) -> None:
 
 
 def reactions_figure(ts: ArrayLike, loads: Mapping[str, Mapping[str, ArrayLike]], title: str = "") -> Figure:
-    """Draw the magnitude of the force at each pin over time."""
+    """Return a figure with the magnitude of the force at each pin over time; `loads` is a result of `udk.reactions`."""
     figure = Figure(figsize=(8, 4.2), layout="constrained")
     draw_reactions(figure.subplots(), ts, loads)
     figure.suptitle(title)
@@ -71,7 +78,7 @@ def reactions_figure(ts: ArrayLike, loads: Mapping[str, Mapping[str, ArrayLike]]
 
 
 def tolerances_figure(found: ToleranceAnalysis, title: str = "") -> Figure:
-    """Draw, for each measure, the samples with the limits, and the shares of the variance."""
+    """Return a figure with a row for each measure: a histogram of the samples with the limits, and the shares of the variance."""
     figure = Figure(figsize=(8, 0.6 + 2.4 * len(found.names)), layout="constrained")
     for k, (name, (samples, bars)) in enumerate(
         zip(found.names, figure.subplots(len(found.names), 2, squeeze=False), strict=True)

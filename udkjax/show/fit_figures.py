@@ -28,7 +28,7 @@ SAMPLES_PER_LAG = 4  # smallest number of samples per lag
 
 
 class Series(NamedTuple):
-    """The samples of a channel of a record."""
+    """The samples of one channel in one record, with predictions, residuals, and standard deviations of the noise."""
 
     record: str
     channel: str
@@ -41,7 +41,10 @@ class Series(NamedTuple):
 
 
 def series(data: "xarray.Dataset") -> list[Series]:
-    """Return the series of all records, channel by channel; channels that a record lacks are left out."""
+    """Return the series of all records, channel by channel, from the dataset of `Estimate.to_xarray`.
+
+    Channels that a record lacks are left out.
+    """
     all_series = []
     for c, r in product(range(data.sizes["channel"]), range(data.sizes["record"])):
         channel_of_record = data.isel(record=r, channel=c)
@@ -60,7 +63,10 @@ def series(data: "xarray.Dataset") -> list[Series]:
 
 
 def fit(data: "xarray.Dataset", most_panels: int = MOST_PANELS) -> Figure:
-    """Draw measurements as points, and predictions as lines."""
+    """Return a figure with a panel for each channel of each record: measurements as points, and predictions as lines.
+
+    If there are more than `most_panels` of them, only the first are drawn.
+    """
     all_series, records = series(data), data.sizes["record"]
     columns, panels = _panels(data, all_series, most_panels)
     rows = 1 + max(panels) // columns
@@ -90,7 +96,10 @@ def draw_series(axes: Axes, item: Series) -> None:
 
 
 def _panels(data: "xarray.Dataset", all_series: list[Series], most_panels: int) -> tuple[int, dict[int, Series]]:
-    """Return the number of columns, and the series by index of the panel; up to three records are side by side."""
+    """Return the number of columns, and the series to draw by the index of their panels, which are counted row by row.
+
+    Two or three records have one column each.
+    """
     records, channels = list(data["record"].values), list(data["channel"].values)
     columns, places = min(MOST_COLUMNS, -(-len(all_series) // 4)), list(range(len(all_series)))
     if 1 < len(records) <= MOST_COLUMNS:
@@ -100,7 +109,10 @@ def _panels(data: "xarray.Dataset", all_series: list[Series], most_panels: int) 
 
 
 def residuals(data: "xarray.Dataset", most_channels: int = MOST_CHANNELS) -> Figure:
-    """Draw the residuals of each channel over time, their distribution and that of the noise, and their autocorrelation."""
+    """Return a figure with a row for each channel: residuals over time, their distribution, and their autocorrelation.
+
+    If there are more than `most_channels`, those are drawn whose residuals look least like noise.
+    """
     all_series = series(data)
     channels = _least_white(data, most_channels)
     shown = channels[:most_channels]
@@ -131,7 +143,10 @@ def residuals(data: "xarray.Dataset", most_channels: int = MOST_CHANNELS) -> Fig
 
 
 def _least_white(data: "xarray.Dataset", most_channels: int) -> list[str]:
-    """Return the channels to draw; if there are too many, those whose residuals look least like noise."""
+    """Return the names of all channels, beginning with those to draw.
+
+    If there are more than `most_channels`, the channels to draw are those whose residuals look least like noise.
+    """
     names = [str(name) for name in data["channel"].values]
     if len(names) <= most_channels:
         return names
@@ -149,7 +164,7 @@ def _over_time(axes: Axes, item: Series, colour: str) -> None:
 
 
 def _distribution(axes: Axes, of_channel: list[Series]) -> None:
-    """Draw a histogram of all records, and the density of Gaussian noise with the assumed standard deviations."""
+    """Draw a histogram of the residuals of all records, and the density of Gaussian noise of the assumed size."""
     left = np.concatenate([item.residual for item in of_channel])
     noise = np.concatenate([item.noise for item in of_channel])
     if np.ptp(left) > 0:

@@ -25,21 +25,27 @@ ZERO_DRAWN = 1e-18  # drawn instead of zero on a logarithmic axis
 
 
 def pictures(data: "xarray.Dataset") -> dict[str, Figure]:
-    """Draw the dataset of `Estimate.to_xarray`, with or without profile likelihoods."""
+    """Return the figures of an identification by name, drawn from the dataset of `Estimate.to_xarray`.
+
+    The names are "fit", "residuals", "convergence"; with several parameters "correlation"; with profile likelihoods "profiles".
+    """
     figures = {"fit": fit(data), "residuals": residuals(data), "convergence": convergence(data)}
     figures |= {"correlation": correlation(data)} if data.sizes["parameter"] > 1 else {}
     return figures | ({"profiles": profiles(data)} if "profile" in data else {})
 
 
 def save_fit_pictures(data: "xarray.Dataset", folder: Path) -> Iterator[str]:
-    """Write each picture to the folder, and yield its file name."""
+    """Write each of the `pictures` to the folder as a PNG file, and yield its file name."""
     for name, figure in pictures(data).items():
         figure.savefig(folder / f"{name}.png", dpi=150)
         yield f"{name}.png"
 
 
 def correlation(data: "xarray.Dataset") -> Figure:
-    """Draw the correlations of the parameters' errors, and the standard errors; unidentifiable ones are grey."""
+    """Return a figure with the correlations of the parameters' errors, and the standard errors.
+
+    Correlations of unidentifiable parameters are grey.
+    """
     names = [_short(str(name)) for name in data["parameter"].values]
     values, count = data["correlation"].values, len(names)
     size = 0.42 if count <= MOST_WRITTEN else 0.26
@@ -63,7 +69,7 @@ def correlation(data: "xarray.Dataset") -> Figure:
 
 
 def _errors(axes: Axes, data: "xarray.Dataset") -> None:
-    """Draw standard errors in percent of the values; infinite ones get a label."""
+    """Draw standard errors in percent of the values; in place of infinite errors, write "unknown"."""
     error, value = data["standard_error"].values, np.abs(data["value"].values)
     with np.errstate(divide="ignore", invalid="ignore"):
         percent = np.where(np.isfinite(error), np.clip(100 * error / value, ZERO_DRAWN, LARGEST_ERROR), np.nan)
@@ -80,7 +86,7 @@ def _errors(axes: Axes, data: "xarray.Dataset") -> None:
 
 
 def convergence(data: "xarray.Dataset") -> Figure:
-    """Draw the cost of each trial, and the largest change of an unknown in the next step.
+    """Return a figure with the cost of each trial of the fit, and the largest change of an unknown in the next step.
 
     Within a fit the cost never rises. Where it rises, another fit begins, with a longer part of the records, another guess, or
     other weights.
@@ -104,13 +110,13 @@ def convergence(data: "xarray.Dataset") -> Figure:
 
 
 def _short(name: str) -> str:
-    """Return the name of a parameter; for tied parameters, the first name and how many there are."""
+    """Return the name of a parameter; for tied parameters, the first name and the number of names."""
     first, *others = name.split(" = ")
     return f"{first} = ... ({len(others) + 1} tied)" if others else first
 
 
 def profiles(data: "xarray.Dataset") -> Figure:
-    """Draw profile likelihoods, their approximations from the standard errors, and the confidence intervals.
+    """Return a figure of profile likelihoods, their approximations from the standard errors, and the confidence intervals.
 
     The rise of the cost C is 2 (C - C_min) / s^2; for a linear model, it is the square of the distance in standard errors.
     """

@@ -131,7 +131,10 @@ def draw_violation(axes: Axes, ts: ArrayLike, violated: ArrayLike) -> Axes:
 
 
 def draw_energy(axes: Axes, ts: ArrayLike, parts: Energy) -> Axes:
-    """Draw the kinetic, potential and total energy over time; the latter two minus the total energy at the start."""
+    """Draw the kinetic, potential and total energy over time.
+
+    The total energy at the start is subtracted from the latter two.
+    """
     start = np.asarray(parts.total)[0]
     axes.plot(ts, np.asarray(parts.kinetic), color=COLOURS[0], lw=1, label="kinetic")
     axes.plot(ts, np.asarray(parts.potential) - start, "--", color=COLOURS[2], lw=1, label="potential")
@@ -142,7 +145,9 @@ def draw_energy(axes: Axes, ts: ArrayLike, parts: Energy) -> Axes:
 
 
 def draw_sweep(axes: Axes, data: "xarray.Dataset", name: str) -> Axes:
-    """Draw a number of each member of a sweep, as a heat map over two axes or a line over one; missing values are grey.
+    """Draw a variable of a sweep, one number per member, as a heat map over two axes of the sweep or as a line over one.
+
+    Missing values in a map are grey.
 
     Raises:
         ValueError: the sweep has more than two axes; select values of the others by `data.sel` or `data.isel`.
@@ -219,7 +224,7 @@ def draw_fit(axes: Axes, data: "xarray.Dataset", channel: str, record: str | Non
 
 
 def farthest_instants(q: Float[np.ndarray, "T bodies 3"], count: int) -> list[int]:
-    """Return up to `count` instants whose poses differ most: the first instant, then always the farthest from the chosen ones."""
+    """Return the indices of up to `count` poses that differ most: the first, then always the farthest from the chosen ones."""
     poses = np.concatenate([q[..., :2], np.cos(q[..., 2:]), np.sin(q[..., 2:])], axis=-1).reshape(len(q), -1)
     chosen, distance = [0], np.linalg.norm(poses - poses[0], axis=1)
     while len(chosen) < count and distance.max() > 0:
@@ -229,7 +234,7 @@ def farthest_instants(q: Float[np.ndarray, "T bodies 3"], count: int) -> list[in
 
 
 def _outlines(drawn: Sequence[Mark]) -> Iterator[tuple[int, Float[np.ndarray, "points 2"], bool]]:
-    """Iterate over the lines that bodies are drawn with: index of the body, points in its frame (m), True for a closed line."""
+    """Yield the lines with which bodies are drawn: index of the body, points in its frame (m), True for a closed line."""
     for mark in drawn:
         if mark["kind"] in (MarkKind.LINK, MarkKind.OUTLINE):
             yield mark["body"], np.add(mark["points"], mark.get("at", (0.0, 0.0))), mark.get("closed", True)
@@ -239,12 +244,15 @@ def _outlines(drawn: Sequence[Mark]) -> Iterator[tuple[int, Float[np.ndarray, "p
 
 
 def _units(mech: Mechanism) -> Units:
-    """Return the units of a drawing; SI units without one."""
+    """Return the units of a mechanism's drawing; SI units for a mechanism without a drawing."""
     return Units(dict(mech.drawing.units) if isinstance(mech.drawing, Drawing) else None)
 
 
 def _plane(axes: Axes, units: Units | None = None) -> Axes:
-    """Label the axes of a plane in m, or with the unit of lengths of a drawing."""
+    """Label the axes of a plane with the unit of lengths in `units`, by default m, make their scales equal, and return them.
+
+    Places are drawn in m, whatever the unit of the labels.
+    """
     unit, size = ("m", 1.0) if units is None else (units.shown("m"), units.size("m"))
     axes.set(xlabel=f"x ({unit})", ylabel=f"y ({unit})", aspect="equal")
     for axis in (axes.xaxis, axes.yaxis):

@@ -25,7 +25,9 @@ LEVELS = {0.5: "--", 0.95: "-"}  # joint confidence of the ellipses, and their d
 
 @checked
 def plot_posterior(posterior: Posterior, estimate: Estimate | None = None, names: Sequence[str] | None = None) -> Figure:
-    """Draw the draws of each number as a histogram, and of each pair of numbers as points: a corner plot.
+    """Draw a corner plot of a posterior: the draws of each number as a histogram, and of each pair of numbers as points.
+
+    The numbers are the unknowns of an identification.
 
     Args:
         posterior: draws from `sample`.
@@ -67,7 +69,7 @@ def plot_posterior(posterior: Posterior, estimate: Estimate | None = None, names
 
 
 def draw_marginal(axes: Axes, posterior: Posterior, name: str, estimate: Estimate | None = None) -> Axes:
-    """Draw a histogram of the draws of a number, and the normal distribution by its standard error."""
+    """Draw a histogram of the draws of an unknown, and the normal distribution of an estimate with its standard error."""
     values = posterior.draws[name].ravel()
     axes.hist(values, bins=40, range=_range(values), density=True, color=COLOURS[4], label="draws")
     error = estimate.standard_errors.get(name, np.inf) if estimate is not None else np.inf
@@ -80,7 +82,7 @@ def draw_marginal(axes: Axes, posterior: Posterior, name: str, estimate: Estimat
 
 
 def draw_pair(axes: Axes, posterior: Posterior, one: str, other: str, estimate: Estimate | None = None) -> Axes:
-    """Draw the draws of two numbers as points, and the joint confidence ellipses of an estimate."""
+    """Draw a point for each draw of two unknowns, `one` along x, and the joint confidence ellipses of an estimate."""
     x, y = (posterior.draws[name].ravel() for name in (one, other))
     every = -(-len(x) // MOST_POINTS)
     axes.scatter(x[::every], y[::every], 3, COLOURS[4], lw=0, alpha=0.6, label="draws", rasterized=True)
@@ -101,7 +103,10 @@ def _range(values: np.ndarray) -> tuple[float, float]:
 
 
 def draw_prediction(axes: Axes, posterior: Posterior, channel: str, record: int = 0) -> Axes:
-    """Draw the measurements of a channel, and the range in which 94 % of repeated measurements would be."""
+    """Draw the measurements of a channel in a record, and the range that would contain 94 % of repeated measurements.
+
+    `record` is the index of the record; the median of the predictions is drawn as a line.
+    """
     return _draw_prediction(axes, posterior, record, channel, posterior.prediction_intervals()[record][channel])
 
 
@@ -120,7 +125,7 @@ def _draw_prediction(axes: Axes, posterior: Posterior, record: int, channel: str
 
 
 def prediction_figure(posterior: Posterior) -> Figure:
-    """Draw measurements and predictions of all channels and records."""
+    """Return a figure with a panel for each channel of each record, up to `MOST_PANELS`: measurements and predictions."""
     intervals = posterior.prediction_intervals()
     shown = [(k, name) for k, channels in enumerate(intervals) for name in channels][:MOST_PANELS]
     columns = min(MOST_COLUMNS, -(-len(shown) // 4))
@@ -135,7 +140,7 @@ def prediction_figure(posterior: Posterior) -> Figure:
 
 
 def save_posterior_pictures(posterior: Posterior, estimate: Estimate, folder: Path) -> Iterator[str]:
-    """Write the pictures to the folder, and yield their file names."""
+    """Write the pictures of a posterior to the folder as PNG files, and yield their file names."""
     for name, figure in {"corner": plot_posterior(posterior, estimate), "predictions": prediction_figure(posterior)}.items():
         figure.savefig(folder / f"{name}.png", dpi=150)
         yield f"{name}.png"

@@ -21,10 +21,10 @@ def embedded(draw: Callable[[], "Figure"], alt: str, caption: str, kind: str = "
     """Return a picture with its caption as HTML that needs no other file.
 
     Args:
-        draw: draws the picture.
-        alt: a description of the picture.
+        draw: function that returns the figure.
+        alt: a description of the picture, for readers who cannot see it.
         caption: the caption, as HTML.
-        kind: a class of the style sheet.
+        kind: a class of the style sheet report.css; "" for none.
     """
     with rc_context({"svg.hashsalt": "udkjax", "path.simplify_threshold": 1.0}):
         buffer = io.BytesIO()

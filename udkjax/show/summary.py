@@ -17,7 +17,7 @@ from udkjax.wording import join_names, numbered, plural
 
 
 def check_summary(mech: Mechanism, check: Check) -> str:
-    """Describe the findings of `udkjax.positions.answers.scene_check.check` about a mechanism."""
+    """Return the findings of `udkjax.positions.answers.scene_check.check` about a mechanism as a table of text."""
     lines = check.lines()
     lines["constraint equations"] += f" in {plural(len(mech.joints), 'joint')} and {plural(len(mech.drivers), 'driver')}"
     lines["redundant constraints"] = ", ".join(row_label(mech, *row) for row in check.redundant) or "none"
@@ -32,7 +32,16 @@ def check_summary(mech: Mechanism, check: Check) -> str:
 def run_summary(
     mech: Mechanism, sol: Solution, accuracy: Accuracy, seconds: float, compiling: float, moved: Sequence[str] = ()
 ) -> str:
-    """Describe the result, work, accuracy and time of a run, and the distance by which assembly `moved` bodies."""
+    """Return the result, work, accuracy and time of a run as a table of text.
+
+    Args:
+        mech: the mechanism.
+        sol: the run.
+        accuracy: the accuracy of the run.
+        seconds: wall time of the run (s).
+        compiling: the part of this time that was spent on compiling (s).
+        moved: descriptions of moves by assembly, the result of `moves_of_assembly`.
+    """
     lines = {
         "result": sol.cause if sol.result else sol.result.name,
         **numbered("assembly", [text.removeprefix("assembly ") for text in moved]),
@@ -46,12 +55,12 @@ def run_summary(
 
 
 def known_efforts(mech: Mechanism, sol: Solution) -> dict[str, Array]:
-    """Return the efforts of the drivers; none where a link has no mass."""
+    """Return the efforts (torques or forces) of the drivers over time; {} if a link has no mass, since they are unknown then."""
     return {} if mech.massless else efforts(mech, sol)
 
 
 def trust(accuracy: Accuracy) -> dict[str, str]:
-    """Describe the largest constraint violation, the energy and, if it is known, the error of the solution."""
+    """Return the lines of a summary, by title, about constraint violation, energy and, if it is known, error of the solution."""
     kinetic = f"kinetic up to {accuracy.kinetic_energy:.3g} J"
     if accuracy.work is None:
         change = format_error(accuracy.energy_change, accuracy.kinetic_energy)
@@ -68,7 +77,7 @@ def trust(accuracy: Accuracy) -> dict[str, str]:
 
 
 def format_peak(ts: ArrayLike, effort: ArrayLike, unit: str) -> str:
-    """Describe the torque or force of a driver over time by its peak and its root mean square."""
+    """Return the peak and the root mean square of a driver's torque or force as text; "unknown" if no value is finite."""
     x = np.asarray(effort, float)
     good = x[np.isfinite(x)]
     if not good.size:

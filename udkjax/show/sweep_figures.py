@@ -35,7 +35,7 @@ MOST_PANELS = 12  # number of panels in one picture; of other dimensions only th
 
 
 def pictures(data: "xarray.Dataset", most_panels: int = MOST_PANELS) -> dict[str, Figure]:
-    """Draw the dataset of a sweep: `result`, and each variable that has one number per member and differs between members.
+    """Return figures of a sweep's dataset by variable: `result`, and the `scalars` that differ between members.
 
     The two dimensions with the most values are the axes of a map; each combination of the others has a panel. A single dimension
     is drawn as a line. Members of a design, which has no grid, are points over its first two axes.
@@ -45,7 +45,7 @@ def pictures(data: "xarray.Dataset", most_panels: int = MOST_PANELS) -> dict[str
 
 
 def scalars(data: "xarray.Dataset") -> list[str]:
-    """Return the variables with one number for each member."""
+    """Return the names of the variables, other than `result`, with one number for each member."""
     return [
         str(n)
         for n in data.data_vars
@@ -84,7 +84,11 @@ def _picture(data: "xarray.Dataset", name: str, most_panels: int) -> Figure:
 
 
 def draw_panel(axes: Axes, data: "xarray.Dataset", name: str) -> ScalarMappable | None:
-    """Draw `result` or another variable with one number per member; returns the mappable of a colour bar, None for a line."""
+    """Draw `result` or another variable with one number per member; return the mappable of a colour bar, None for a line.
+
+    Raises:
+        ValueError: the sweep has more than two dimensions.
+    """
     across, panels = _layout(data)
     if len(panels) > 1:
         raise ValueError(
@@ -102,7 +106,7 @@ def _panel(axes: Axes, part: "xarray.Dataset", name: str, across: Sequence[str],
 
 
 def _layout(data: "xarray.Dataset", most_panels: int = MOST_PANELS) -> tuple[tuple[str, ...], list[tuple[dict[str, int], str]]]:
-    """Return the dimensions of the axes, and for each panel its indices in the other dimensions and its title."""
+    """Return the dimensions that are axes of a panel, and for each panel its indices in the other dimensions and its title."""
     dims = _dims(data)
     longest = sorted(dims, key=lambda d: (_numeric(data, d), data.sizes[d]), reverse=True)[:2]
     across = (MEMBER_DIMENSION,) if MEMBER_DIMENSION in dims else tuple(d for d in dims if d in longest)
@@ -159,7 +163,7 @@ def _line(axes: Axes, part: "xarray.Dataset", name: str, dim: str) -> None:
 
 
 def _points(axes: Axes, part: "xarray.Dataset", name: str, cmap: Colormap | str, norm: Normalize) -> ScalarMappable:
-    """Draw the members of a design over its first two axes, or its only one."""
+    """Draw the members of a design over its first two axes, or, if it has a single axis, the values over this one."""
     names = [
         str(c)
         for c in part.coords
@@ -193,25 +197,28 @@ def name_results(bar: Colorbar) -> None:
 
 
 def _codes() -> Colours:
-    """Return a colour for each result, and a colour for other codes."""
+    """Return the colour map and the norm of result codes: a colour for each `Result`, and one for all other codes."""
     count = len(Result) + 1
     return ListedColormap(RESULT_COLOURS[:count]), BoundaryNorm(np.arange(count + 1) - 0.5, count)
 
 
 def _scale(values: np.ndarray) -> Colours:
-    """Return a scale of colours from the smallest to the largest value, logarithmic if their ratio is large."""
+    """Return a colour map and its norm, from the smallest to the largest value, logarithmic if their ratio is large."""
     finite = values[np.isfinite(values)]
     low, high = (finite.min(), finite.max()) if finite.size else (0.0, 1.0)
     return "viridis", LogNorm(low, high) if _decades(finite) else Normalize(low, high)
 
 
 def _drawable(values: "xarray.DataArray", name: str) -> "xarray.DataArray":
-    """Return values to draw: all codes outside `Result` are replaced by the same code."""
+    """Return the values to draw; of `result`, all codes outside `Result` are replaced by a single code."""
     return values.where(values.isin([int(r) for r in Result]), len(Result)) if name == RESULT_VARIABLE else values
 
 
 def _edges(part: "xarray.Dataset", dim: str, scale: Callable[[str], object]) -> np.ndarray:
-    """Return the edges of a map's cells: halfway between values, or between the positions of labels."""
+    """Return the edges of a map's cells: halfway between values, or between the positions of labels.
+
+    `scale` sets the scale of the axis; it is called if the values span decades.
+    """
     if not _numeric(part, dim):
         return np.arange(part.sizes[dim] + 1) - 0.5
     values = part[dim].values.astype(float)
@@ -235,7 +242,7 @@ def _decades(values: np.ndarray) -> bool:
 
 
 def _numeric(data: "xarray.Dataset", dim: str) -> bool:
-    """Return True if the values of a dimension are distinct numbers in order."""
+    """Return True if the values of a dimension are numbers that increase, or decrease, from each to the next."""
     values = data[dim].values
     return values.dtype.kind in "iuf" and (len(values) < 2 or bool(np.all(np.diff(values) > 0) or np.all(np.diff(values) < 0)))
 
@@ -263,7 +270,7 @@ def _result(code: int) -> str:
 
 
 def save_sweep_pictures(data: "xarray.Dataset", folder: Path) -> Iterator[str]:
-    """Write each picture to the folder, and yield its file name."""
+    """Write each of the `pictures` to the folder as a PNG file, and yield its file name."""
     for name, figure in pictures(data).items():
         figure.savefig(folder / f"{name}.png", dpi=150)
         yield f"{name}.png"

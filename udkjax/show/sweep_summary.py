@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def estimate_summary(plan: SweepPlan, cost: SweepCost) -> str:
-    """Describe the work of a sweep."""
+    """Return the estimated work of a sweep (members, programs, memory, time) as a table of text."""
     shape = " x ".join(f"{dimension.size} {dimension.name}" for dimension in plan.dimensions)
     tried = "" if cost.tried == cost.groups else f", of which {cost.tried} were tried"
     computing, compiling = duration(cost.computing), duration(cost.compiling)
@@ -36,7 +36,11 @@ def estimate_summary(plan: SweepPlan, cost: SweepCost) -> str:
 
 
 def sweep_results(data: "xarray.Dataset") -> dict[str, Any]:
-    """Return the number of members of a sweep by result, and the range of each number saved per member."""
+    """Return the results of a sweep as plain data: `members` (their number), `results` and `ranges`.
+
+    `results` has the number of members by the name of their result, `ranges` the units and the least, largest and median value
+    of each number saved per member.
+    """
     codes, counts = np.unique(data[RESULT_VARIABLE].values, return_counts=True)
     known = {int(result): result.name for result in Result}
     ranges = {}
@@ -50,7 +54,10 @@ def sweep_results(data: "xarray.Dataset") -> dict[str, Any]:
 
 
 def sweep_summary(data: "xarray.Dataset", seconds: float) -> str:
-    """Describe the results of the members of a sweep, and the range of each number saved per member."""
+    """Return the results of a sweep's members, and the range of each number saved per member, as a table of text.
+
+    `seconds` is the wall time of the sweep.
+    """
     results = sweep_results(data)
     ended = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in results["results"].items())
     lines = {"members": f"{results['members']}: {ended}"}

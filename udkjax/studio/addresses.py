@@ -25,15 +25,15 @@ def address_of(text: str) -> str:
 
 
 def is_address(words: str) -> bool:
-    """Return whether words are meant as the address of a drawing, perhaps a damaged one."""
+    """Return True if words are meant as the address of a drawing, even a damaged one; a path of a .toml file is none."""
     return KEY in words and not words.endswith(".toml")
 
 
 def text_of(address: str) -> str:
-    """Return the text of a drawing from its address; line breaks and spaces, as of a message, do not matter.
+    """Return the text of a drawing from its address; line breaks and spaces within it, as in a message, do not matter.
 
     Raises:
-        RefusedError: the address is not that of a drawing, or it is damaged: it ends with a checksum.
+        RefusedError: the words are not the address of a drawing, the address is damaged, or the drawing is too long.
     """
     if KEY not in address:
         raise RefusedError(400, f"this is no address of a drawing, which begins with {SCHEME}")

@@ -41,7 +41,7 @@ EXPORTS = (".html", ".svg", ".png", ".gif", ".mp4", ".dxf", ".csv", ".py")
 
 
 class Studio:
-    """The actions of the routes, on one folder.
+    """The actions of the server's routes, on the files of one folder; the top of this file lists their requests and answers.
 
     Args:
         folder: folder of the files to open and save.
@@ -54,7 +54,7 @@ class Studio:
         self.folder, self.reader, self.compiler, self.examiner = folder, reader, compiler, examiner
 
     def list(self, request: JsonObject) -> JsonObject:
-        """Return the folder's scene files, and the templates."""
+        """Return the paths of the folder's scene files, the folder's name, and the templates."""
         templates = self.reader.call("list_templates", {}, COMPILE_SECONDS)
         return {"files": self.folder.list(), "folder": self.folder.root.name, **templates}
 
@@ -93,7 +93,7 @@ class Studio:
         return {"path": path, "revision": self.folder.write(path, data, revision, EXPORTS), "bytes": len(data)}
 
     def compile(self, request: JsonObject) -> JsonObject:
-        """Return a drawing's text and tables, its mistakes, and the data with which the page moves it."""
+        """Return a drawing's text and tables, its mistakes, and, if an `engine` is requested, the data that move it."""
         given = {key: request[key] for key in ("text", "document", "engine") if request.get(key) is not None}
         require_size(given.get("text"))
         if not isinstance(given.get("document", {}), dict):
@@ -109,7 +109,7 @@ class Studio:
         return self.examiner.call("diagnose_drawing", given, DIAGNOSE_SECONDS)
 
     def design(self, request: JsonObject) -> JsonObject:
-        """Return mechanisms with a pin that draws a wanted path, or the path of a table."""
+        """Return mechanisms with a pin that draws a wanted path; or, for a request with a `table`, the path in this table."""
         path, unit, seed = request.get("path"), request.get("unit", "mm"), request.get("seed", 0)
         if "table" in request and unit in Units.sizes("m"):
             given = {"text": require_size(request["table"]), "name": str(request.get("name", "the table")), "unit": unit}
@@ -120,7 +120,7 @@ class Studio:
 
 
 def application(studio: Studio, port: int, token: str) -> ASGIApp:
-    """Return the server, protected by its gate.
+    """Return the server of the studio as an ASGI application, protected by a `Gate`.
 
     Args:
         studio: the actions of its routes.
@@ -158,7 +158,7 @@ async def _page_file(request: Request) -> Response:
 
 
 def page_files() -> Mapping[str, tuple[bytes, str]]:
-    """Return the content and the media type of each file of the page by its address."""
+    """Return the content and the media type of each file of the page, by its path on the server."""
     contents = {UNIT_SIZES: (_unit_sizes().encode(), MEDIA_TYPES[".js"])}
     for prefix, (package, folder) in FOLDERS.items():
         root = files(package).joinpath(folder)

@@ -22,9 +22,14 @@ SHAPE = ("density", "thickness", "width", "outline", "mass", "inertia", "centre"
 
 
 def drawn_fix(text: str, mechanism: Mechanism, fix: Fix) -> JsonObject:
-    """Return a fix of the mechanism of a drawing: its description, and the changed `document`, None if it cannot be drawn.
+    """Return a fix of a drawing's mechanism as JSON: its description, `change`, and the changed tables, `document`.
 
-    A document is returned only if it can be read, and has the bodies, forces, drivers and joints of the fix.
+    The document is None if no change of the drawing can be read and has the bodies, forces, drivers and joints of the fix.
+
+    Args:
+        text: text of the drawing.
+        mechanism: mechanism of the drawing.
+        fix: a fix of its redundant constraints.
     """
     joint, changed, change = mechanism.joints.get(fix.constraint), fix.mechanism.joints.get(fix.constraint), fix.change
     tables, candidates = read_document(text), iter(())
@@ -44,7 +49,7 @@ def drawn_fix(text: str, mechanism: Mechanism, fix: Fix) -> JsonObject:
 
 
 def _is_fixed(text: str, document: Document, fixed: Mechanism) -> bool:
-    """Return whether a changed document of a text can be read as a mechanism."""
+    """Return True if a text with the tables of a document can be read, and gives the mechanism `fixed`, judged by `_is_same`."""
     try:
         return _is_same(loads(merge_document(text, document)), fixed)
     except SceneError:  # such as a motor at a pin that two links no longer share
@@ -56,7 +61,7 @@ def _angle(mechanism: Mechanism, body: str) -> Number:
 
 
 def _without(tables: Document, constraint: str) -> Iterator[Document]:
-    """Iterate over documents without an element."""
+    """Yield the document without the element that is named `constraint`, for each section with such an element."""
     for section in (s for s in LISTS if s != "link"):
         entries = tables.get(section, [])
         for k, entry in enumerate(entries):
@@ -66,7 +71,11 @@ def _without(tables: Document, constraint: str) -> Iterator[Document]:
 
 
 def _without_pin(tables: Document, mechanism: Mechanism, joint: Revolute, constraint: str) -> Iterator[Document]:
-    """Iterate over documents in which one of two bodies has lost their pin: the ground, or a link, at last by its numbers."""
+    """Yield documents in which one of the two bodies of a revolute has lost its pin.
+
+    First the ground loses it, if it is one of the bodies; then each link; then each link again, with its mass, inertia and centre
+    written as numbers, since its shape would give other numbers without the pin.
+    """
     pin = _pin_of(tables, constraint)
     if GROUND in joint.bodies:
         yield {**tables, "ground": [name for name in tables.get("ground", ()) if name != pin]}
@@ -89,15 +98,18 @@ def _body_numbers(mechanism: Mechanism, body: str) -> JsonObject:
 
 
 def _pin_of(tables: Document, constraint: str) -> str:
-    """Return the pin of a revolute, whose name is the pin's, with a number if the pin has more than two links."""
+    """Return the pin of a revolute by the revolute's name; "" if there is none.
+
+    A revolute is named like its pin, followed by "-" and a number if the pin has more than two links.
+    """
     return max((name for name in tables["pins"] if constraint == name or constraint.startswith(f"{name}-")), key=len, default="")
 
 
 def _split(tables: Document, base: str, guided: str, constraint: str) -> tuple[Document, str]:
-    """Return the document in which two bodies no longer share the pin of a revolute, and the pin that stays with `guided`.
+    """Return the document in which two bodies do not share the pin of a revolute, and the pin that belongs to `guided`.
 
-    Of the links at a pin, each turns on the first. It keeps the pin, and the other link gets a new one in the same place, so that
-    both keep their shapes. The ground has no shape: where it is the base of a single link, it loses the pin.
+    Of the links at a pin, each turns on the first. The first link keeps the pin, and the other one gets a new pin at the same
+    place, so that both keep their shapes. The ground has no shape: where it is the base of a single link, it loses the pin.
     """
     pin = _pin_of(tables, constraint)
     met = [GROUND] * (pin in tables.get("ground", ())) + [link["name"] for link in tables["link"] if pin in link["pins"]]
@@ -121,7 +133,7 @@ def _with_slot(tables: Document, pin: str, base: str, angle: float) -> Document:
 
 
 def _is_same(drawn: Mechanism, fixed: Mechanism) -> bool:
-    """Return whether a drawing has the bodies of a mechanism, and elements of the same classes between the same bodies."""
+    """Return True if two mechanisms have the same bodies, and elements of the same classes between the same bodies."""
 
     def bodies(mechanism: Mechanism) -> np.ndarray:
         return np.array([[b.mass, b.inertia, *b.position] for _, b in sorted(mechanism.bodies.items())], float)

@@ -34,7 +34,7 @@ def drawing_text_of(mechanism: Mechanism) -> str:
 
 
 class _Draft:
-    """A drawing under construction: places and members of pins by name, and elements by section."""
+    """A drawing under construction: places of pins, and bodies that they join (`members`), by name; elements by section."""
 
     def __init__(self, mechanism: Mechanism):
         self.mechanism = mechanism
@@ -91,7 +91,10 @@ class _Draft:
         return np.array([x + c * px - s * py, y + s * px + c * py])
 
     def pin(self, name: str, bodies: Sequence[str], position: np.ndarray) -> str:
-        """Return the pin of bodies at a position: a pin that one of them already has at this position, or else a new pin."""
+        """Return the name of the pin of bodies at a position: a pin that one of them has there already, or else a new pin.
+
+        `name` is the name of a new pin, with primes if it is taken.
+        """
         for pin, pin_position in self.places.items():
             if np.abs(position - pin_position).max() <= self.near and set(bodies) & set(self.members[pin]):
                 self.members[pin] += [body for body in bodies if body not in self.members[pin]]
@@ -110,7 +113,7 @@ class _Draft:
         return float(self.frames[bodies[1]][2] - self.frames[bodies[0]][2])
 
     def joint(self, name: str, joint: Joint) -> None:
-        """Draw a joint other than a pin."""
+        """Draw a joint; revolute joints are skipped, since their pins are drawn before."""
         match joint:
             case Revolute():
                 return
@@ -139,7 +142,7 @@ class _Draft:
         return [float(np.cos(angle)), float(np.sin(angle))]
 
     def pin_between(self, bodies: Sequence[str]) -> str:
-        """Return the pin about which two bodies turn on each other, or an empty string."""
+        """Return the name of the pin about which two bodies turn on each other; "" if there is none."""
         return next((pin for pin, members in self.members.items() if set(bodies) <= set(members)), "")
 
     def driver(self, name: str, driver: Driver) -> None:
@@ -191,7 +194,10 @@ class _Draft:
         self.format_1.append((section, name, element))
 
     def in_links(self, element: Any) -> Any:
-        """Return an element with its points in link frames: origin at the centre of mass, x from the first pin to the second."""
+        """Return an element with its points in the frames of links.
+
+        The origin of such a frame is the centre of mass, and its x axis leads from the link's first pin to the second.
+        """
         moved = []
         for body, point in zip(element.bodies, np.asarray(element.points), strict=True):
             position = self.world_point(body, point)

@@ -41,7 +41,7 @@ FORMULA = ("=", "+", "-", "@", "\t")  # a spreadsheet evaluates cells that begin
 
 
 def exported(mechanism: Mechanism, text: str, suffix: str, pose: JsonObject | None = None, has_gaps: bool = False) -> bytes:
-    """Return a drawing in the format of a file name suffix.
+    """Return a drawing as the content of a file in the format of a suffix.
 
     Args:
         mechanism: mechanism of the drawing.
@@ -71,7 +71,7 @@ def exported(mechanism: Mechanism, text: str, suffix: str, pose: JsonObject | No
 
 
 def _posed(mechanism: Mechanism, pose: JsonObject) -> tuple[StateHistory, float]:
-    """Return a motion with a pose of a mechanism, and the time (s) of the pose."""
+    """Return a motion that contains a pose of a mechanism, and the time (s) of this pose in the motion."""
     q = pose.get("q")
     if q is None:
         try:
@@ -83,7 +83,7 @@ def _posed(mechanism: Mechanism, pose: JsonObject) -> tuple[StateHistory, float]
 
 
 def finite_numbers(given: Any, name: str, shape: tuple[int, ...]) -> np.ndarray:
-    """Return numbers of a request as an array; raise `RefusedError` unless they have a shape and are finite."""
+    """Return numbers of a request as an array; raise `RefusedError` unless they are finite and have the given shape."""
     try:
         found = np.asarray(given, float)
     except (TypeError, ValueError):
@@ -94,7 +94,7 @@ def finite_numbers(given: Any, name: str, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def shown(mechanism: Mechanism, run: StateHistory, suffix: str, has_gaps: bool = False) -> Animation:
-    """Return a run as an animation; if it is a page, it is live if the mechanism can be compiled to machine code."""
+    """Return a run as an animation; for .html it is a live page, if a page can simulate the mechanism."""
     if suffix == ".html":
         with contextlib.suppress(ValueError, UnsupportedError):
             return animate(mechanism, run, live=True)

@@ -36,7 +36,7 @@ IN_LINE = 1e-4  # rad: the error of an angle at a dead point is the square root 
 
 
 def examine(mechanism: Mechanism, text: str, about: str, end: JsonObject | None = None) -> JsonObject:
-    """Return the findings about a subject.
+    """Return the findings about a subject as JSON, with `problems`: the reason why there are none, or an empty list.
 
     Args:
         mechanism: mechanism of the drawing.
@@ -46,6 +46,9 @@ def examine(mechanism: Mechanism, text: str, about: str, end: JsonObject | None 
             course), "gaps" (between links), or "end" (the cause of the early end of a run).
         end: for "answers", the value `at` of the motor, a text with its unit; for "end", a state `t`, `q`, `v` of the run, as the
             page sends it, and the time `end` (s) at which it ended.
+
+    Raises:
+        RefusedError: there is no such subject, or `end` lacks numbers.
     """
     if about == "end":
         return {"cause": _cause(mechanism, end or {}), "problems": []}
@@ -67,7 +70,10 @@ def examine(mechanism: Mechanism, text: str, about: str, end: JsonObject | None 
 
 
 def answers(mechanism: Mechanism, at: object = None) -> JsonObject:
-    """Return the characteristics of a mechanism with one motor, and tables of its pins, links and instant centres at a value."""
+    """Return the characteristics of a mechanism with one motor, and tables of pins, links and instant centres in one position.
+
+    Without a single motor, both are empty. `at` is the value of the motor as a text with its unit; by default it is as drawn.
+    """
     if len(mechanism.driver_names) != 1:
         return {"answers": [], "tables": []}
     driver = only_driver(mechanism)
@@ -84,7 +90,10 @@ def answers(mechanism: Mechanism, at: object = None) -> JsonObject:
 
 
 def least_gaps(mechanism: Mechanism) -> JsonObject:
-    """Return the least gap of each pair of links over the range of the motor, its pose, and the outlines of links as drawn."""
+    """Return the least gap of each pair of links over the range of the motor, with the pose in which it occurs.
+
+    `counted` describes the zero of the motor's values; `parts` and `pairs` are the outlines of links in frames of the drawing.
+    """
     found = gaps(mechanism, only_driver(mechanism))
     frames = {name: np.array([*np.asarray(body.position), body.angle]) for name, body in mechanism.bodies.items()}
     rows = [
@@ -96,7 +105,7 @@ def least_gaps(mechanism: Mechanism) -> JsonObject:
 
 
 def _cause(mechanism: Mechanism, end: JsonObject) -> str:
-    """Return why motors stopped a run; empty if they did not."""
+    """Return the reason why motors stopped a run, which ended as `end` describes; "" if they did not stop it."""
     try:
         t, until, q, v = float(end["t"]), float(end["end"]), *(np.asarray(end[key], float) for key in "qv")
     except (KeyError, TypeError, ValueError):
@@ -107,7 +116,10 @@ def _cause(mechanism: Mechanism, end: JsonObject) -> str:
 
 
 def structure(mechanism: Mechanism, text: str) -> JsonObject:
-    """Return degrees of freedom, sets of redundant constraints with their fixes, and reactions that are not unique."""
+    """Return degrees of freedom, sets of redundant constraints with their fixes, and reactions that are not unique.
+
+    `motion` says in words if the mechanism moves, and `conflict` why no velocities satisfy its constraints.
+    """
     diagnosis = diagnose(mechanism, walk=False)
     not_unique = {
         name: {"components": [bool(x) for x in forces.unique], "direction": forces.direction}
@@ -139,7 +151,7 @@ def structure(mechanism: Mechanism, text: str) -> JsonObject:
 
 
 def _conflict(mechanism: Mechanism) -> str:
-    """Return why no velocities satisfy all constraints as drawn, with the names of the motors; empty if some velocities do."""
+    """Return the reason why no velocities satisfy all constraints as drawn, with the names of the motors; "" if some do."""
     try:
         assemble(mechanism)
     except AssemblyError as error:
@@ -148,7 +160,7 @@ def _conflict(mechanism: Mechanism) -> str:
 
 
 def _why(diagnosis: Diagnosis, mechanism: Mechanism) -> str:
-    """Describe how the mechanism moves, or why it does not."""
+    """Return a sentence about the motion of a mechanism: its cause, or the reason why there is none, with advice."""
     drivers = list(mechanism.drivers)
     if diagnosis.joint_mobility <= 0:
         if diagnosis.is_singular:
@@ -171,7 +183,7 @@ def _freedom(count: int) -> str:
 
 
 def rest(mechanism: Mechanism) -> JsonObject:
-    """Return the stable equilibrium near the drawn position, and its natural frequencies (Hz)."""
+    """Return the stable equilibrium near the drawn position, and its natural frequencies (Hz); `q` is None if none was found."""
     balance = equilibrium(mechanism, stable=True)
     rates = [float(x) for x in np.asarray(balance.omega2)]
     return {
@@ -182,7 +194,11 @@ def rest(mechanism: Mechanism) -> JsonObject:
 
 
 def motor_travel(mechanism: Mechanism) -> JsonObject:
-    """Return the travel of each motor, with the others held, as values count (`words`), and the pins in line at its limits."""
+    """Return the travel of each motor, with the others held, and the pins that are in line at its limits.
+
+    Limits are counted from the zero that `words` describe. Left out are motors that do not determine the positions, and drivers
+    of a coordinate y.
+    """
     travels = []
     for name, driver in mechanism.drivers.items():
         if driver.coordinate == "y":
@@ -229,7 +245,10 @@ def pins_in_line(mechanism: Mechanism, q: np.ndarray) -> list[list[str]]:
 
 
 def _add_to_line(lines: list[list[str]], pins: list[str], places: dict[str, np.ndarray]) -> None:
-    """Add three collinear pins to the line that contains two of their positions, or as a new line, without coincident pins."""
+    """Add three collinear pins to the line that contains two of their positions, or else as a new line.
+
+    A pin at the place of a pin of the line is not added to it.
+    """
     near = IN_LINE * np.ptp(list(places.values()), axis=0).max()
     for line in lines:
         new = [pin for pin in pins if all(np.linalg.norm(places[pin] - places[other]) > near for other in line)]

@@ -46,7 +46,11 @@ class Folder:
                     yield name
 
     def locate(self, name: object, suffixes: tuple[str, ...]) -> Path:
-        """Return the file of a relative path; raise `RefusedError` if it is not inside the folder."""
+        """Return the file of a relative path, which need not exist.
+
+        Raises:
+            RefusedError: the path is not that of a file inside the folder, has another suffix, or its subfolder does not exist.
+        """
         if not isinstance(name, str) or not 0 < len(name) <= MOST_CHARACTERS_OF_A_PATH:
             raise RefusedError(400, "path: must be the path of a file in the studio's folder")
         parts = PurePosixPath(name).parts
@@ -65,7 +69,7 @@ class Folder:
         return path
 
     def read(self, name: object) -> tuple[str, str]:
-        """Return the text and the revision of a scene file."""
+        """Return the text and the revision of a scene file; raise `RefusedError` if it cannot be read or is too long."""
         path = self.locate(name, (SCENE_SUFFIX,))
         try:
             if path.stat().st_size > 4 * MOST_TEXT_CHARACTERS:

@@ -28,7 +28,7 @@ class RefusedError(Exception):
 
 
 def count_elements(document: Mapping[str, Any]) -> int:
-    """Return the number of pins and tables of a document."""
+    """Return the number of pins and other entries in all tables and lists of a document."""
     return sum(len(value) for value in document.values() if isinstance(value, list | dict))
 
 

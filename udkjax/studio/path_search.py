@@ -30,12 +30,16 @@ def find_mechanisms(path: object, unit: str = "mm", seed: int = 0) -> JsonObject
     Args:
         path: places [x, y] of the path (m), in order; it is closed if its ends nearly meet.
         unit: unit of lengths of the drawings.
-        seed: number of the search; each finds other mechanisms, up to the fourth with more bars and more time. Every second one
-            has slides.
+        seed: number of the search, from 0: each search finds other mechanisms. Up to number 3, each has more bars and more time
+            than the one before; searches of odd number use slides, too.
 
     Returns:
-        `designs`, the best first, each with its `document`, `text`, the largest `deviation` of the path (m), whether the crank
-        `turns`, and its smallest transmission angle (rad); `extent` of the wanted path (m), and `reason` if nothing was found.
+        `designs`, those that deviate least first, each with its `document`, `text`, largest `deviation` from the path (m),
+        `turns` (true if the crank turns fully), and smallest `transmission` angle (rad); `extent` of the wanted path (m); and
+        `reason`, if nothing was found.
+
+    Raises:
+        RefusedError: the path is not a list of places, or no search is possible for it.
     """
     points = _points(path)
     extent = float(np.linalg.norm(np.ptp(points, axis=0)))
@@ -55,7 +59,7 @@ def find_mechanisms(path: object, unit: str = "mm", seed: int = 0) -> JsonObject
 
 
 def path_of_table(name: str, text: str, unit: str) -> list[list[float]]:
-    """Return the places [x, y] (m) of a table of a wanted path, with lengths in `unit`."""
+    """Return the places [x, y] (m) of a wanted path from the text of a table, with lengths in `unit`; `name` is for messages."""
     try:
         points = Units.sizes("m")[unit] * read_curve_table(name, text)
     except ValueError as problem:
@@ -88,7 +92,7 @@ def _drawn(design: CurveDesign, points: np.ndarray) -> JsonObject:
 
 
 def _rounded(value: Any) -> Any:
-    """Return a document with numbers of few digits."""
+    """Return a document with its numbers rounded to `DIGITS` significant digits."""
     if isinstance(value, dict):
         return {key: _rounded(entry) for key, entry in value.items()}
     if isinstance(value, list):

@@ -29,7 +29,7 @@ def serve(root: Path, opened: str = "", port: int = 0, browse: bool = True, say:
 
     Args:
         root: the folder whose files may be opened and saved.
-        opened: path of a file in the folder that the page opens, or the address of a drawing, or empty.
+        opened: path of a file in the folder, or address of a drawing, that the page opens; "" for neither.
         port: port at which to listen; 0 for any free port.
         browse: True to open a browser.
         say: function that shows the address to the user.

@@ -29,7 +29,10 @@ FIRST_STEPS = 2_000  # of the first attempt at a run; two turns of a linkage tak
 
 
 def duration_of(mechanism: Mechanism) -> float:
-    """Return the duration of a run (s): turns of the slowest motor, travel of a slide across the mechanism, or else swings."""
+    """Return the duration (s) of the run of a drawing, rounded to two digits.
+
+    With motors, the slowest one turns twice, or moves across the mechanism; without, the run lasts some characteristic times.
+    """
     scales, durations = analyse(mechanism), []
     for name, driver in mechanism.drivers.items():
         if (speed := constant_speed(mechanism, name)) != 0:
@@ -42,7 +45,8 @@ def duration_of(mechanism: Mechanism) -> float:
 def shown_run(mechanism: Mechanism) -> Solution:
     """Return the run that is shown; a failed run has NaN from its failure on.
 
-    Where a motor asks for more than the linkage can reach, a run takes its largest number of steps to no avail: first come a few.
+    Where a motor asks for more than the linkage can reach, a run would take its largest number of steps in vain. For this reason
+    a run is first tried with few steps, and repeated with more if it reached this limit without being stopped by motors.
     """
     ts = np.linspace(0.0, duration_of(mechanism), INSTANTS)
     run = simulate(mechanism, ts, rtol=TOLERANCE, atol=TOLERANCE, max_steps=FIRST_STEPS, throw=False)
@@ -52,14 +56,17 @@ def shown_run(mechanism: Mechanism) -> Solution:
 
 
 def _is_stopped(mechanism: Mechanism, run: Solution) -> bool:
-    """Return whether motors stopped a run that reached its limit of steps."""
+    """Return True if motors stopped a run that reached its limit of steps."""
     ts, q, v = (np.asarray(x) for x in (run.ts, run.q, run.v))
     last = int(np.flatnonzero(np.isfinite(q).all((1, 2)))[-1])
     return bool(cause_of_standstill(mechanism, float(ts[-1]), (float(ts[last]), q[last], v[last]), float(run.time)))
 
 
 def recorded_motion(mechanism: Mechanism) -> JsonObject:
-    """Return the run as plain numbers: `q` and `v` of all bodies at `times`, and `cause`, the reason for an early end."""
+    """Return the run as plain numbers: `q` and `v` of all bodies at `times`, until it ended.
+
+    `cause` is the reason for an early end; "" for a complete run.
+    """
     run = shown_run(mechanism)
     q, v = np.asarray(run.q), np.asarray(run.v)
     alive = np.isfinite(q).all((1, 2)) & np.isfinite(v).all((1, 2))
@@ -118,7 +125,7 @@ def _efforts(mechanism: Mechanism, run: StateHistory, kind: str) -> list[JsonObj
 
 
 def _pin_forces(mechanism: Mechanism, run: StateHistory) -> list[JsonObject]:
-    """Return curves of the forces at pins; forces that are not unique are marked; these are minimum-norm values."""
+    """Return curves of the forces at pins; forces that are not unique, of which the minimum-norm values are shown, are marked."""
     unique = unique_pin_forces(mechanism, run)
     curves = []
     for pin, bodies in pin_reactions(mechanism, run).items():
@@ -136,6 +143,6 @@ def _rate(driver: Driver, ts: np.ndarray) -> np.ndarray:
 
 
 def _curve(name: str, unit: str, values: Any, unique: bool = True) -> JsonObject:
-    """Return a curve as JSON, with null for NaN."""
+    """Return a curve as JSON, with null for NaN; `unique` is False for forces that redundant constraints share."""
     numbers = [x if math.isfinite(x) else None for x in np.asarray(values, float).tolist()]
     return {"name": name, "unit": unit, "values": numbers, "unique": unique}

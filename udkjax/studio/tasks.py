@@ -65,14 +65,18 @@ def list_templates() -> JsonObject:
 
 
 def open_template(name: str) -> JsonObject:
-    """Return the text and tables of a template."""
+    """Return a template as `open_text` does; raise `RefusedError` if there is no template of this name."""
     if not isinstance(name, str) or name not in {**DRAWN, **TEMPLATES}:
         raise RefusedError(404, f"there is no template {name!r}")
     return open_text(template_text(name))
 
 
 def open_text(text: str) -> JsonObject:
-    """Return a scene file as the text and tables of a drawing; a scene of bodies and joints (format 1) is converted."""
+    """Return a scene file as the `text` and the tables, `document`, of a drawing.
+
+    A scene of bodies and joints (format 1) is converted into a drawing; `drawn` is True then. If a text cannot be read or drawn,
+    `problems` has the reasons, and the document is None.
+    """
     problems: list[str] = []
     drawn = text
     try:
@@ -89,7 +93,7 @@ def open_text(text: str) -> JsonObject:
 
 
 def _named_pins(text: str, document: JsonObject) -> tuple[str, JsonObject]:
-    """Return the text and the tables of a drawing whose links name the pins that they have at the holes of files."""
+    """Return the text and the tables of a drawing in which links that take their pins from holes of files name these pins."""
     links, pins = document.get("link"), document.get("pins", {})
     if not isinstance(links, list) or all("pins" in link for link in links if isinstance(link, dict)):
         return text, document
@@ -139,7 +143,7 @@ def compile_drawing(text: str = "", document: Mapping[str, Any] | None = None, e
 
 
 def outlines_of_files(drawing: Drawing, document: JsonObject) -> list[JsonObject]:
-    """Return the outlines that links take from files: the `file` as it is named, and corners of `outline` and `holes` (m)."""
+    """Return the outlines that links take from files: the name of the `file`, and the corners of `outline` and `holes` (m)."""
     found = []
     for link, given in zip(drawing.links.values(), document.get("link", []), strict=True):
         if not isinstance(given.get("outline", []), list):
@@ -149,7 +153,10 @@ def outlines_of_files(drawing: Drawing, document: JsonObject) -> list[JsonObject
 
 
 def engine_of(mechanism: Mechanism, document: JsonObject) -> JsonObject:
-    """Return the page's engine of a drawing and, for pulling, an engine without motors (`hand`); or the reason `why` not."""
+    """Return the `engine` with which the page moves a drawing, and an engine without motors, `hand`, for pulling.
+
+    `hand` is None for a drawing without motors. If an engine is impossible, `why` has the reason.
+    """
     pins = list(document.get("pins", {}))
     names = [f"pin.{pin}" for pin in pins]
     try:
@@ -164,13 +171,13 @@ def engine_of(mechanism: Mechanism, document: JsonObject) -> JsonObject:
 
 
 def _by_coordinates(mechanism: Mechanism) -> Mechanism:
-    """Return the mechanism of the drawing with its pins by coordinates, which the page sends for pins of any form."""
+    """Return the mechanism of a drawing with all pins given by coordinates, which the page sends for pins of any form."""
     assert isinstance(mechanism.drawing, Drawing)
     return mechanism.drawing.by_coordinates().mechanism()
 
 
 def _undriven(document: JsonObject) -> JsonObject:
-    """Return a drawing without driven motions; cylinders become dampers without damping, which keep their pins in use."""
+    """Return a drawing without prescribed motions; cylinders become dampers without damping, which keep their pins."""
     motors = document.get("motor", [])
     idle = [{"between": motor["between"], "damping": 0} for motor in motors if "between" in motor]
     torques = [motor for motor in motors if "torque" in motor]
@@ -210,7 +217,10 @@ def scene_of(mechanism: Mechanism) -> JsonObject:
 
 
 def turning_of(mechanism: Mechanism, name: str) -> JsonObject:
-    """Return the bodies of a driver of an angle (`pair`, -1 for the ground) and the `offset` (rad) of its count; else nothing."""
+    """Return the bodies of a driver of an angle (`pair`, -1 for the ground) and the `offset` (rad) added to show its values.
+
+    Return {} for a driver of any other coordinate.
+    """
     driver = mechanism.drivers[name]
     if driver.coordinate != "angle":
         return {}
@@ -220,7 +230,7 @@ def turning_of(mechanism: Mechanism, name: str) -> JsonObject:
 
 
 def diagnose_drawing(text: str, about: str = "structure", end: JsonObject | None = None) -> JsonObject:
-    """Return the findings about a drawing; `about` is a subject of findings.py, and `end` that of a run."""
+    """Return the findings about a drawing; for the subject `about` and for `end`, see `examine` in findings.py."""
     try:
         require_few(read_document(text))
         return in_studio_words(examine(loads(text), text, about, end))
@@ -231,7 +241,7 @@ def diagnose_drawing(text: str, about: str = "structure", end: JsonObject | None
 
 
 def export(text: str, suffix: str, pose: JsonObject | None = None, has_gaps: bool = False) -> JsonObject:
-    """Return an export of a drawing as hexadecimal bytes; `pose` and `has_gaps` are those of `exported`."""
+    """Return an export of a drawing as hexadecimal bytes; for `pose` and `has_gaps`, see `exported` in exports.py."""
     try:
         require_few(read_document(text))
         mechanism = loads(text)
@@ -245,7 +255,7 @@ def export(text: str, suffix: str, pose: JsonObject | None = None, has_gaps: boo
 
 
 def find_path(path: object, unit: str = "mm", seed: int = 0) -> JsonObject:
-    """Return mechanisms with a pin that draws a wanted path."""
+    """Return mechanisms with a pin that draws a wanted path, as `find_mechanisms` in path_search.py does."""
     from udkjax.studio.path_search import find_mechanisms  # imports the synthesis, which other tasks need not
 
     return find_mechanisms(path, unit, seed)

@@ -100,7 +100,7 @@ def _holds_tables(item: Any) -> bool:
 
 
 def _merge_list(old: Any, new: Sequence[Mapping[str, Any]]) -> None:
-    """Change a list of tables; tables with the same name or content keep their place and comments."""
+    """Change a list of tables so that it equals `new`; tables with the same name or content keep their place and comments."""
     old_keys = [_mark(_unwrapped(table)) for table in old]
     new_keys = [_mark(table) for table in new]
     offset = 0

@@ -59,7 +59,7 @@ def studio_words(message: str) -> str:
 
 
 def in_studio_words(answer: Any) -> Any:
-    """Return an answer of JSON values with its sentences in the words of the studio."""
+    """Return an answer of JSON values in which the sentences, the values of the keys in `SUBJECTS`, are in the studio's words."""
     if isinstance(answer, list):
         return [in_studio_words(x) for x in answer]
     if not isinstance(answer, dict):

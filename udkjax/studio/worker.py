@@ -22,10 +22,11 @@ END_SECONDS = 5.0  # time to wait for a killed process
 
 
 class Worker:
-    """Runs the functions of `tasks.py` one at a time in a separate process, which is replaced if a function takes too long.
+    """A separate process that runs the functions of `tasks.py` one at a time, and that is replaced if a function takes too long.
 
     Args:
-        folder: the folder in which it runs, where drawings name files of outlines.
+        folder: the working directory of the process, to which the files of outlines in drawings are relative; by default, that of
+            this process.
     """
 
     def __init__(self, folder: Path | None = None) -> None:
@@ -39,7 +40,7 @@ class Worker:
             self._ensure()
 
     def call(self, name: str, arguments: Mapping[str, Any], seconds: float) -> dict[str, Any]:
-        """Return the answer of a task; raise `RefusedError` if it refuses, fails, or takes longer than `seconds`."""
+        """Return the answer of the task `name`; raise `RefusedError` if it refuses, fails, or takes longer than `seconds`."""
         with self._lock:
             connection = self._ensure()
             try:
@@ -84,11 +85,11 @@ class Worker:
 
 
 class WorkerPool:
-    """Workers of which a free one runs a task, so that a new drawing does not wait until an old one is compiled.
+    """Several workers, of which a free one runs a task, so that a new drawing need not wait until an old one is compiled.
 
     Args:
         count: number of workers; only the first starts before it is needed.
-        folder: the folder in which they run.
+        folder: the working directory of their processes.
     """
 
     def __init__(self, count: int, folder: Path | None = None):
@@ -99,7 +100,7 @@ class WorkerPool:
         self.workers[0].start()
 
     def call(self, name: str, arguments: Mapping[str, Any], seconds: float) -> dict[str, Any]:
-        """Return the answer of a task, as `Worker.call`; if no worker is free, it waits for the first."""
+        """Return the answer of a task, as `Worker.call` does; if no worker is free, wait for the first worker."""
         return next((one for one in self.workers if not one.is_busy), self.workers[0]).call(name, arguments, seconds)
 
     def close(self) -> None:
@@ -108,7 +109,7 @@ class WorkerPool:
 
 
 def _serve(connection: Connection, folder: Path | None) -> None:
-    """Answer requests until the connection is closed."""
+    """Answer requests, each with the name and the arguments of a task, until the connection is closed."""
     if folder is not None:
         os.chdir(folder)
     tasks = import_module(TASKS)

@@ -115,7 +115,10 @@ def animate(
 
 
 def _run(file: Path, t1: float, dt: float) -> "ShownRun":
-    """Return the mechanism of a file, its run, and the file's further measures."""
+    """Return the mechanism of a file, its run, and further measures that the file contains, by "name (unit)".
+
+    A scene is simulated until `t1` with an output time each `dt`, and has no further measures.
+    """
     if file.suffix.lower() in (".toml", ".xml") or is_of_library(file) or not (file.suffix or file.exists()):
         mechanism, _ = load(file)
 
@@ -134,7 +137,7 @@ def _run(file: Path, t1: float, dt: float) -> "ShownRun":
 
 
 def _measures(wanted: tuple[str, ...], runs: dict[str, "ShownRun"]) -> "dict[str, dict[str, np.ndarray] | None]":
-    """Return the measures by name: None if a measure is to be computed, else its values in the file of each run."""
+    """Return the wanted measures by name: None if a measure is to be computed, else its values in the file of each run."""
     measures: dict[str, dict[str, np.ndarray] | None] = {}
     for name in wanted:
         by_run = {

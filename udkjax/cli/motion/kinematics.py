@@ -159,7 +159,7 @@ def kinematics(
 
 
 def _in_units(columns: "Columns", counted: "Count") -> "Columns":
-    """Return channels in the units of the drawing."""
+    """Return channels with lengths and angles converted from SI units to the units of the drawing."""
     length, size = counted.units.shown("m"), counted.units.size("m")
     shown = {"m": (length, size), "m/s": (f"{length}/s", size), "m/s2": (f"{length}/s²", size)}
     shown["rad"] = counted.units.shown("rad"), counted.units.size("rad")
@@ -168,7 +168,7 @@ def _in_units(columns: "Columns", counted: "Count") -> "Columns":
 
 
 def _end(travel: "Travel", side: int, counted: "Count") -> str:
-    """Return an end of travel as text: its value, or that it has no limit, or that the limit was not found."""
+    """Return the lower (`side` 0) or upper end (1) of a travel as text: its value, "no limit", or that it was not found."""
     import numpy as np
 
     import udkjax as udk
@@ -179,7 +179,7 @@ def _end(travel: "Travel", side: int, counted: "Count") -> str:
 
 
 def _default(given: float | None, limit: float, otherwise: float) -> float:
-    """Return the given value if there is one, else the limit if it is finite, else another value."""
+    """Return the given value if there is one; else the limit if it is finite; else the value `otherwise`."""
     if given is not None:
         return given
     return limit if math.isfinite(limit) else otherwise

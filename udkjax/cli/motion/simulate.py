@@ -136,7 +136,10 @@ def simulate(
 
 @contextmanager
 def _stopwatch() -> Iterator[dict[str, float]]:
-    """Measure the wall time (s), and the part of it spent on tracing and compiling."""
+    """Yield times that are measured when the body of the `with` statement ends.
+
+    They are the wall time of the body, `all` (s), and the part of it spent on tracing and compiling, `compiling` (s).
+    """
     import jax
 
     seconds, spans = {"all": 0.0, "compiling": 0.0}, []

@@ -116,7 +116,10 @@ def design(
 
 
 def _show_curve(file: Path, options: dict[str, Any], size: float | None, unit: str, out: Path | None, json: bool) -> None:
-    """Find mechanisms for a curve of a file, and show them."""
+    """Find mechanisms for the curve in a file, show them, and write them to the folder `out`, unless it is None.
+
+    The command exits with a message if the curve cannot be read, or if no mechanism fits it.
+    """
     import udkjax as udk
     from udkjax.scene.drawing.drawn_quantities import Units
     from udkjax.synthesis.curves.curve_file import read_curve_file
@@ -150,7 +153,7 @@ def _show_curve(file: Path, options: dict[str, Any], size: float | None, unit: s
 
 
 def _show_all(file: Path, search: Any, results: int, out: Path | None, json: bool) -> None:
-    """Find all solutions of a goal; show how many there are, and list the first."""
+    """Find all solutions of a goal, show their number and the first `results` of them, and write these to `out` if given."""
     import udkjax as udk
     from udkjax.show.summary import table
 
@@ -217,7 +220,13 @@ def _page(candidate: Any, goal: Any) -> Any:
 
 
 def _moving_page(candidate: Any, traces: list[str] | None, targets: Any) -> Any:
-    """Return a design as a page with the targets: live for one turn of its motor, or else the motion over the driver's values."""
+    """Return a design as a page with the targets: live for one turn of its motor, or else its motion over the driver's values.
+
+    Args:
+        candidate: the design.
+        traces: points whose paths are drawn; None for the moving pins.
+        targets: wanted places (n, 2) on the ground (m); None for none.
+    """
     import numpy as np
 
     import udkjax as udk

@@ -123,7 +123,7 @@ def identify(
 
 
 def _write_draws(drawn: "Posterior", folder: Path) -> Mapping[str, Any]:
-    """Write draws and their summary, and return the summary."""
+    """Write the draws and their summary to a folder, and return the summary."""
     import json
 
     from udkjax.study.report import plain
@@ -136,7 +136,7 @@ def _write_draws(drawn: "Posterior", folder: Path) -> Mapping[str, Any]:
 
 
 def _write(estimate: "Estimate", profiles: Sequence["ProfileLikelihood"], results: Mapping[str, object], out: Path) -> list[str]:
-    """Write all files, and return their names."""
+    """Write the scene, the results, the dataset and the pictures of an estimate to the folder, and return the file names."""
     import csv
     import json
 

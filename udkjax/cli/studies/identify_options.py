@@ -17,9 +17,12 @@ Found = TypeVar("Found")
 
 
 class IdentifyOptions:
-    """Parameters by name; `options` maps arguments of `Parameter` to strings from the command line, such as NAME=VALUE.
+    """The `parameters` to identify, made from the options of the command line; mistakes are collected in `problems`.
 
-    Mistakes are collected in `problems`.
+    Args:
+        mechanism: the mechanism.
+        parameters: names of the parameters, in groups, one for each time that the option was given.
+        options: strings such as NAME=VALUE, in such groups, by the argument of `Parameter` that they set: guess, bounds or prior.
     """
 
     def __init__(self, mechanism: Mechanism, parameters: Groups, options: Mapping[str, Groups]):
@@ -35,7 +38,7 @@ class IdentifyOptions:
             self.problems.append("--parameters: name at least one, such as body.link1.mass")
 
     def check(self, settings: Mapping[str, Any]) -> None:
-        """Check that the parameters exist, and that the settings are valid."""
+        """Check that the parameters exist and that the settings are valid; add mistakes to `problems`."""
         if self.parameters:
             self.names = self._try(lambda: unknowns_of(self.mechanism, self.parameters).names, ())
         if settings["n_starts"] < 0:
@@ -46,7 +49,14 @@ class IdentifyOptions:
             self.problems.append(f"--seed {settings['seed']}: must not be negative")
 
     def records(self, data: Sequence[Path], noise: Groups, ignore: Groups, start: Estimated) -> list[Record]:
-        """Read the data files into records."""
+        """Return the records of the data files; mistakes are added to `problems`, and files with mistakes give no records.
+
+        Args:
+            data: files of measurements.
+            noise: standard deviations as NUMBER, for all channels, or CHANNEL=NUMBER.
+            ignore: columns to ignore.
+            start: parts of each record's initial state to estimate.
+        """
         if not data:
             self.problems.append("give a file of measurements (.csv or .nc) after the scene")
             return []
@@ -57,7 +67,7 @@ class IdentifyOptions:
         return [record.changed(initial_state=Start(estimate=start)) for record in loaded]
 
     def profiled(self, groups: Groups) -> list[str]:
-        """Return the names in the estimate of parameters given by their full name, or by one of several tied names."""
+        """Return the names in the estimate of parameters that are given by their full name, or by one of several tied names."""
         full_names = {_plain(alias): name for name in self.names for alias in (name, *name.split("="))}
         given = [text for group in groups for text in group]
         if self.names:
@@ -69,7 +79,7 @@ class IdentifyOptions:
         return list(dict.fromkeys(full_names[_plain(text)] for text in given if _plain(text) in full_names))
 
     def _noise(self, groups: Groups) -> tuple[float | None, dict[str, float]]:
-        """Return the standard deviation of all channels, and those of individual channels."""
+        """Return the standard deviation for all channels, None if it is not given, and those of individual channels by name."""
         everywhere, by_channel = None, {}
         for text in (text for group in groups for text in group):
             channel, _, number = text.rpartition("=")
@@ -85,7 +95,7 @@ class IdentifyOptions:
         return everywhere, by_channel
 
     def _add(self, given: dict[str, dict[str, Any]], option: str, text: str) -> None:
-        """Add an option of a parameter, given by its full name or by any of several tied names."""
+        """Add an option to the options `given` of a parameter, which its text names in full or by any of several tied names."""
         option_text = f"--{option} {quote(text)}"
         name, _, numbers = text.rpartition("=")
         parameter = {_plain(alias): full_name for full_name in given for alias in (full_name, *full_name.split("="))}.get(
@@ -116,7 +126,7 @@ class IdentifyOptions:
 
 
 def _numbers(text: str, count: int) -> list[float] | None:
-    """Parse `count` comma-separated finite numbers; None if the text is anything else."""
+    """Return `count` comma-separated finite numbers; None if the text is anything else."""
     try:
         numbers = [float(word) for word in text.split(",")]
     except ValueError:

@@ -81,7 +81,7 @@ def report(
 
 
 def _module(name: str) -> ModuleType:
-    """Import a module of the study from the installed package, or from a clone."""
+    """Import a module of the paper's study from the installed package, or else from a clone; exit with a message without both."""
     package = "udkjax.paper" if find_spec("udkjax.paper") else "experiments.paper"
     try:
         return import_module(f"{package}.{name}")

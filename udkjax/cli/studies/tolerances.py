@@ -87,7 +87,7 @@ def tolerances(
 
 
 def _pairs(option: str, given: Iterable[str]) -> list[tuple[str, str]]:
-    """Return the name and the text of each "NAME=VALUE"."""
+    """Return the name and the value of each text "NAME=VALUE"; exit with a message if one has another form."""
     pairs = []
     for text in given:
         name, equals, value = (part.strip() for part in text.rpartition("="))

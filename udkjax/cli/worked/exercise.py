@@ -50,7 +50,7 @@ def exercise(
 
 
 def _names(path: Path) -> list[str]:
-    """Return the names of a table: its first column, without a heading."""
+    """Return the names in the first column of a table (.csv), without a heading; exit with a message if it cannot be read."""
     try:
         rows = list(csv.reader(path.read_text(encoding="utf-8-sig").splitlines()))
     except (OSError, UnicodeDecodeError, csv.Error) as problem:

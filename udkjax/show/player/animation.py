@@ -59,9 +59,9 @@ class Animation:
     Python can control.
 
     Attributes:
-        data: data of the player, as JSON.
+        data: data of the player, as JSON (player_data.py).
         failures: causes of failed runs by label.
-        mechanisms: the mechanism of each run, whose points and links pictures name.
+        mechanisms: the mechanism of each run; pictures with labels name its points and links.
         gaps: the gaps between links of each run; None for a run without them.
     """
 
@@ -129,7 +129,10 @@ class Animation:
         return path
 
     def pose(self, t: float | None = None) -> list[Float[np.ndarray, "bodies 3"]]:
-        """Return the coordinates of each run at time t (s; for modes the fraction of a cycle), as the player shows them."""
+        """Return the coordinates of the bodies of each run at time t, as the player shows them.
+
+        t is in s, or for modes the fraction of a cycle; by default it is the start of the motion.
+        """
         t = float(self.data["start"] if t is None else t)
         return [motion(t) for motion in self._motions]
 
@@ -140,17 +143,20 @@ class Animation:
         return self._paths
 
     def arrows(self, t: float | None = None) -> list[list[ForceArrow]]:
-        """Return the arrows of the reactions of each run at time t (s); empty if reactions are not shown."""
+        """Return the arrows of the reactions of each run at time t (s), by default at the start; none if they are not shown."""
         t = float(self.data["start"] if t is None else t)
         return [arrows(t) for arrows in self._arrows]
 
     def sticking(self, t: float | None = None) -> list[list[list[float]]]:
-        """Return the places [body, x, y] of the joints of each run that stick at time t (s)."""
+        """Return the places [body, x, y] of the joints of each run that stick at time t (s), by default at the start."""
         t = float(self.data["start"] if t is None else t)
         return [stuck_at(record, t) for record in self.data["runs"]]
 
     def touching(self, t: float | None = None) -> list[list[JsonObject]]:
-        """Return the outlines {body, points, radius} of the links of each run that touch at time t (s), if gaps are shown."""
+        """Return the outlines {body, points, radius} of the links of each run that touch at time t (s), by default at the start.
+
+        The list of a run without gaps is empty.
+        """
         shown = zip(self.data["runs"], self.gaps, self.pose(t), strict=True)
         return [
             []
@@ -191,8 +197,8 @@ def animate(
     """Show the motion of a mechanism, or several motions side by side and synchronized.
 
     Args:
-        mechanism: the mechanism that moves; for runs of different mechanisms, a mechanism for each label. A `ConstrainedSystem`
-            with its `drawing`.
+        mechanism: the mechanism that moves; for runs of different mechanisms, a mechanism for each label; or a
+            `ConstrainedSystem`, which needs a `drawing`.
         solution: a `Solution`, or any object with ts (T,), q and v (T, bodies, 3); for several runs a mapping by label, such as
             {"projected": first, "not stabilized": second}. By default the mechanism is shown at rest, as in its scene.
         drawing: for a `ConstrainedSystem` a function of t and q in jax.numpy that returns x, y (m) and, if it turns, the angle
@@ -212,11 +218,12 @@ def animate(
         live: parameters (`parameters()`), or single entries of them, that get sliders in a live page. Such a page simulates the
             motion again when a number changes, and lets the reader pull bodies. {"pin.B[0]": (0.5, 2.0)} sets the range of a
             slider; True adds sliders for all numbers of the scene. A slider acts on all runs that have its parameter. Without
-            `solution`, ten seconds are simulated. A live page has all of these, which follow its numbers, but
-            "rank"; your own measures are shown for the first motion only.
+            `solution`, ten seconds are simulated. A live page has all measures except "rank", and computes them again for each
+            motion; your own measures are shown for the first motion only.
         gaps: True to paint links red while they touch, also in pictures and films; a page has marks on the timeline where they
-            begin and cease to, and a button that leads to the least gap between links. For other pairs or shapes than those of
-            `udkjax.gaps` by default, its result for the run, or results by label. A live page, whose motion changes, has none.
+            begin and cease to, and a button that leads to the least gap between links. A result of `udkjax.gaps` for the run, or
+            results by label, in place of True, shows other pairs or shapes than its defaults. A live page, whose motion changes,
+            has no gaps.
         events: events of live runs, as for `simulate`; the page locates them in each new motion. It supports the actions `Log`,
             `Stop` and `Impact` (one contact at a time), and draws the lines of contacts.
 
@@ -269,7 +276,7 @@ def _live_runs(
     measures: Measures,
     events: Sequence[ExpandsToEvents],
 ) -> tuple[ShownMotion | Mapping[str, ShownMotion], Measures]:
-    """Return the runs and the measures of a live page."""
+    """Return the runs and the measures of a live page; without `solution`, ten seconds are simulated."""
     mechanisms = [require_mechanism(m) for m in (mechanism.values() if isinstance(mechanism, Mapping) else [mechanism])]
     runs: Any = solution
     if runs is None:

@@ -20,7 +20,7 @@ GIF_TICK = 0.01  # unit of a GIF's frame times (s)
 
 
 def image(animation: Posed, t: float | None = None, width: int = 640, theme: str = "light", labels: bool = False) -> Image.Image:
-    """Return one pose of each run, side by side, as a bitmap."""
+    """Return one pose of each run, side by side, as a bitmap of about `width` px; t is the time (s), by default the start."""
     view, sketches_at_t = sketches(animation, t, width, theme, SMOOTH, labels)
     large = Image.new("RGB", (view.width * len(sketches_at_t), view.height), THEMES[theme]["back"])
     for k, sketch in enumerate(sketches_at_t):
@@ -66,7 +66,11 @@ def _write(panel: Image.Image, text: Text, back: str) -> None:
 
 
 def film_times(animation: Posed, fps: float, speed: float | None) -> np.ndarray:
-    """Return the time of each frame; raise `ValueError` if the film would be too long."""
+    """Return the time (s) of the motion at each frame; `speed` is that of the player by default.
+
+    Raises:
+        ValueError: the film would be too long, or `fps` or `speed` is not positive.
+    """
     data = animation.data
     speed = float(data["speed"] if speed is None else speed)
     if not (0 < fps < np.inf and 0 < speed < np.inf):

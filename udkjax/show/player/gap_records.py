@@ -14,19 +14,19 @@ ShownGaps: TypeAlias = "bool | LeastGaps | Mapping[str, LeastGaps]"
 
 
 def add_gaps(record: JsonObject, mechanism: Mechanism, run: ShownMotion, found: bool | LeastGaps | None) -> LeastGaps | None:
-    """Add the gaps between links to the record of a run: the least one, outlines, and events where links touch and part.
+    """Add the gaps between links to the record of a run: the least gap, outlines, and events where links touch and part.
 
     Args:
         record: the record (player_data.py).
         mechanism: the mechanism of the run.
         run: the run.
-        found: its gaps; True to find those of all pairs, False or None for a run without them.
+        found: a result of `gaps` for the run; True to find the gaps of all pairs, False or None to add nothing.
 
     Returns:
-        The gaps.
+        The gaps; None if nothing was added.
 
     Raises:
-        ValueError: they are not those of a run.
+        ValueError: the gaps were measured along values of a driver, but the run is over time, or vice versa.
     """
     if not isinstance(found, LeastGaps):
         if not found:
@@ -46,11 +46,14 @@ def add_gaps(record: JsonObject, mechanism: Mechanism, run: ShownMotion, found: 
 
 
 def outlines(found: LeastGaps, bodies: Sequence[str], frames: Mapping[str, np.ndarray] | None = None) -> JsonObject:
-    """Return the `parts` of links, {body, points, radius}, and `pairs` of links as lists of the numbers of their parts.
+    """Return the outlines of links as JSON: `parts`, and `pairs`.
+
+    Each of the `parts` is a convex part {body, points, radius} of a link; for each pair of links, `pairs` has two lists, the
+    indices of the parts of both links.
 
     Args:
         found: the gaps.
-        bodies: names of the bodies by number; any other name is the ground, -1.
+        bodies: names of the bodies by index; any other name is the ground, -1.
         frames: x, y, angle (m, m, rad) of the frame of each body in which its points are given; by default its own frame.
     """
     number = {name: k for k, name in enumerate(bodies)}

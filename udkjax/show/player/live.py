@@ -32,7 +32,7 @@ SAME_STATE = 1e-6  # tolerance (characteristic lengths or rad, per characteristi
 def live_data(
     runs: Sequence[tuple[Mechanism, ShownMotion, Mapping[str, Any]]], live: Live, events: Sequence[ExpandsToEvents] = ()
 ) -> JsonObject:
-    """Return the additional data of a live page.
+    """Return the additional data of a live page, as described at the top of this file.
 
     Args:
         runs: mechanism, motion and player data of each run.
@@ -96,7 +96,10 @@ def _engine(
 
 
 def _times(solution: ShownMotion) -> list[float] | None:
-    """Return all output times of a run that ended early, which other numbers may complete; None for a complete run."""
+    """Return the output times of a run that ended early, at most `MOST_INSTANTS`; None for a complete run.
+
+    A page needs them because the run may be complete with other numbers of the scene.
+    """
     ts = np.asarray(solution.ts, float)
     if len(ts) < 2:
         raise ArgumentError("live: the run has a single instant, and no motion to simulate")
@@ -106,7 +109,7 @@ def _times(solution: ShownMotion) -> list[float] | None:
 
 
 def _start(mechanism: Mechanism, solution: ShownMotion) -> JsonObject | None:
-    """Return the initial state of a run; None if it equals the scene's."""
+    """Return the initial state {q, v} of a run; None if it equals the state to which the scene is assembled."""
     t = float(np.asarray(solution.ts)[0])
     q, v = (np.asarray(x, float)[0] for x in (solution.q, solution.v))
     closed, scales = close(mechanism, t).state, analyse(mechanism).scales

@@ -43,7 +43,7 @@ LARGEST_GRAVITY = 20.0  # twice that of the earth (m/s2)
 
 
 class Slider(NamedTuple):
-    """A slider of a page: its parameter, label, section, unit, value and range.
+    """A slider of a page: the name of its parameter, its label, section, unit, value and range (`low`, `high`).
 
     Value and range are in SI units; the page shows `per_unit` times these numbers in the unit of the drawing, `shown`.
     """
@@ -65,7 +65,9 @@ class Slider(NamedTuple):
 
 
 def sliders_of(mechanism: Mechanism, live: Live) -> list[Slider]:
-    """Return the sliders of the wanted parameters.
+    """Return the sliders of the parameters that `live` names, in the order of their sections; if it is True or False, of all.
+
+    In the latter case, profiles of cams and the `pins_in_line` are left out.
 
     Raises:
         SceneError: a name is not a parameter.
@@ -93,7 +95,10 @@ def sliders_of(mechanism: Mechanism, live: Live) -> list[Slider]:
 
 
 def dimensions_of_links(mechanism: Mechanism) -> dict[str, str]:
-    """Return labels of the lengths and angles by which pins are given from others, by parameter: with the link of both pins."""
+    """Return labels for the lengths and angles by which a drawing places pins relative to other pins, by parameter.
+
+    A label has the name of the link that connects the two pins, or else the names of the pins, as "A-B"; {} without a drawing.
+    """
     drawing, found = mechanism.drawing, {}
     if not isinstance(drawing, Drawing):
         return found
@@ -118,7 +123,7 @@ def dimensions_of_links(mechanism: Mechanism) -> dict[str, str]:
 def pins_in_line(mechanism: Mechanism) -> set[str]:
     """Return the parameters of pins of bars with more than two pins: moving a single pin would take it out of line.
 
-    Inner pins that are given on the line of others of the bar stay on it, whatever moves.
+    Bars are left out whose inner pins are defined on the line through other pins of the bar: they stay on it in any case.
     """
     if not isinstance(mechanism.drawing, Drawing):
         return set()
@@ -137,7 +142,7 @@ def in_sections(sliders: Iterable[Slider]) -> list[Slider]:
 
 
 def names_in(mechanism: Mechanism, live: Live) -> Live:
-    """Return the wanted names that are parameters of a mechanism."""
+    """Return the part of `live` that names parameters of a mechanism; True and False are returned as they are."""
     if isinstance(live, bool):
         return live
     known = mechanism.parameters()
@@ -147,7 +152,7 @@ def names_in(mechanism: Mechanism, live: Live) -> Live:
 
 
 def section_of(name: str) -> str:
-    """Return the section of a slider."""
+    """Return the section of the slider of a parameter."""
     parts = _base(name).split(".")
     section, field = parts[0], parts[-1]
     if field in INITIAL_FIELDS or (section == "body" and field in ("position", "angle")):
@@ -156,7 +161,7 @@ def section_of(name: str) -> str:
 
 
 def label_of(name: str) -> str:
-    """Return the label of a parameter: for `joint.A.points[1][0]`, "A point 2 x"."""
+    """Return the label of the slider of a parameter: for `joint.A.points[1][0]`, "A point 2 x"."""
     base, indices = _base(name), [int(k) for k in re.findall(r"\[(\d+)\]", name)]
     parts = base.split(".")
     words = parts[1:] if len(parts) > 1 else parts
@@ -170,7 +175,15 @@ def label_of(name: str) -> str:
 
 
 def usual_range(name: str, unit: str, value: float, length: float, rate: float) -> tuple[float, float]:
-    """Return the default range of a slider: the mechanism's size around a coordinate, or a few times any other number."""
+    """Return the default range of a slider: the mechanism's size around a coordinate, or a few times any other number.
+
+    Args:
+        name: name of the parameter, which tells sizes from coordinates.
+        unit: SI unit of the parameter.
+        value: its value.
+        length: characteristic length of the mechanism (m).
+        rate: characteristic rate of the mechanism (1/s).
+    """
     by_unit = {"m/s": length * rate, "rad/s": rate, "m": length, "rad": 1.0}
     size = abs(value) if abs(value) > LEAST_VALUE * by_unit.get(unit, 0.0) else 0.0
     if unit == "m/s2":
@@ -186,5 +199,5 @@ def usual_range(name: str, unit: str, value: float, length: float, rate: float) 
 
 
 def _base(name: str) -> str:
-    """Return the name of the parameter that an entry belongs to."""
+    """Return the name of a parameter without indices of an entry, such as "[1][0]"."""
     return re.sub(r"(\[\d+\])+$", "", name)

@@ -17,7 +17,10 @@ from udkjax.annotations import JsonObject, Numbers
 
 
 def pack(table: Float[np.ndarray, "T n"], step: Numbers) -> JsonObject:
-    """Return a table of finite numbers, rounded to the `step` of each column (or of all), as plain data."""
+    """Return a table of finite numbers, rounded to the `step` of each column (or of all columns), as plain data.
+
+    These are its `rows` (their number), the `steps` of its columns, and the encoded `bytes`.
+    """
     table = np.asarray(table, float)
     steps = np.broadcast_to(np.asarray(step, float), table.shape[1:])
     integers = np.rint(table / steps).astype(np.int64)

@@ -46,7 +46,8 @@ def as_json(data: object) -> str:
 def module(is_live: bool = True, has_gaps: bool = True) -> str:
     """Return the source of the player: its modules joined into one, without comment lines.
 
-    Half of the source are modules that only a live page needs.
+    Half of the source are modules that only a live page needs; they are left out of other pages. So are modules that show gaps,
+    if a page has none.
     """
     names = (*SHOWING, *(GAPS if has_gaps else ()), *(SOLVING if is_live else ()), *LAST)
     *sources, last = (files("udkjax.show.player").joinpath(f"{name}.js").read_text(encoding="utf-8") for name in names)

@@ -16,15 +16,15 @@ Anchor = tuple[int, float, float]  # a place of a body, by its index; -1 is the 
 Pixels = Float[np.ndarray, "2"]
 
 SIZE = 12.0  # height of letters; all lengths are in units of symbols
-PIN = 7.0  # around the centre of a pin that texts keep clear
-LEVELS = (17.0, 31.0, 45.0)  # from a link to its dimension line
-ABOVE = 8.0  # from a dimension line to the middle of its text
+PIN = 7.0  # half of the side of the square around a pin that texts keep clear
+LEVELS = (17.0, 31.0, 45.0)  # distances from a link to its dimension line, the best first
+ABOVE = 8.0  # distance from a dimension line to the middle of its text
 ARROW, ARROW_WIDTH = 7.0, 2.0  # length and half of the width of an arrow
 GAP, BEYOND = 6.0, 4.0  # of an extension line: from the point, and beyond the dimension line
 
 
 class LinkDimension(NamedTuple):
-    """A length between two points, and its text."""
+    """The text of a length, and the two points between which it is measured."""
 
     words: str
     start: Anchor
@@ -32,14 +32,17 @@ class LinkDimension(NamedTuple):
 
 
 class PictureLabels(NamedTuple):
-    """Names of points by name, and lengths of links."""
+    """The places of points by the names to be written there, and the lengths of links to be drawn as dimensions."""
 
     names: dict[str, Anchor]
     dimensions: list[LinkDimension]
 
 
 def labels_of(mechanism: Mechanism, marks: Sequence[Mark]) -> PictureLabels:
-    """Return the names of a mechanism's points, and the lengths of its links in the units of its drawing, if it has one."""
+    """Return the names of a mechanism's points, and the lengths of its links in the units of its drawing.
+
+    Without a drawing, these are the names of pins alone.
+    """
     drawing = mechanism.drawing
     if drawing is None:
         pins = [mark for mark in marks if mark["kind"] == MarkKind.PIN]
@@ -56,7 +59,10 @@ def labels_of(mechanism: Mechanism, marks: Sequence[Mark]) -> PictureLabels:
 
 
 class PlacedDimension(NamedTuple):
-    """A dimension in a picture: its text, its two points (px), and the distance of its line to their left (px)."""
+    """A dimension in a picture: its text, its two points (px), and the distance of its line to their left (px).
+
+    A negative distance is to the right of the way from the first point to the second.
+    """
 
     words: str
     start: Pixels
@@ -65,7 +71,12 @@ class PlacedDimension(NamedTuple):
 
 
 class Placing:
-    """Places texts one after another in the picture of a pose, each where it covers least of the others and of the links."""
+    """The names and dimensions of a picture, placed one after another, each where it covers least of the others and of the links.
+
+    Args:
+        labels: names of points and lengths of links.
+        sketch: the sketch of the pose in the picture.
+    """
 
     def __init__(self, labels: PictureLabels, sketch: Sketch):
         self.sketch, self.pt = sketch, sketch.view.pt

@@ -69,9 +69,15 @@ class Posed(Protocol):
 def sketches(
     animation: Posed, t: float | None, width: int, theme: str, times: int = 1, labels: bool = False
 ) -> tuple[View, list[Sketch]]:
-    """Return the common view of panels with a total width of `width` px, enlarged by `times`, and the sketches at time t.
+    """Return the view that all panels share, and the sketch of each run at time t, one for each panel.
 
-    With `labels` they have the names of points and the lengths of links.
+    Args:
+        animation: the animation.
+        t: time (s); None for the start.
+        width: total width of the panels (px).
+        theme: "light" or "dark".
+        times: factor by which the panels are enlarged.
+        labels: True to add the names of points and the lengths of links to the sketches.
     """
     if theme not in THEMES:
         raise ValueError(f"theme {theme!r} must be {' or '.join(THEMES)}")
@@ -86,7 +92,7 @@ def sketches(
 
 
 def svg(animation: Posed, t: float | None = None, width: int = 640, theme: str = "light", labels: bool = False) -> str:
-    """Return one pose of each run, side by side, as an SVG picture."""
+    """Return one pose of each run, side by side, as the text of an SVG picture; t is the time (s), by default the start."""
     view, panels = sketches(animation, t, width, theme, labels=labels)
     back = THEMES[theme]["back"]
     total = view.width * len(panels)

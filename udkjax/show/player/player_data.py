@@ -71,7 +71,22 @@ def run_record(
     gaps: Sequence[Gap] = (),
     targets: Numbers | None = None,
 ) -> tuple[Record, Float[np.ndarray, "T bodies 3"]]:
-    """Return a run as plain data, and its poses; a failed run is shown up to its failure."""
+    """Return the record of a run, plain data without symbols, and its shown poses; a failed run is shown up to its failure.
+
+    Args:
+        mechanism: the mechanism of the run.
+        solution: the run.
+        label: label of the run; "" for a single run.
+        measures: curves over time, as for `animate`.
+        with_reactions: True to add arrows of joint forces.
+        traces: joints, bodies or points whose paths are drawn; None for the moving pins.
+        shapes: further points of bodies, as for `animate`.
+        gaps: conditions of contacts, whose lines are drawn.
+        targets: wanted places (n, 2) on the ground (m).
+
+    Raises:
+        ValueError: the run has no finite state.
+    """
     ts, q, v = (np.asarray(x, float) for x in (solution.ts, solution.q, solution.v))
     alive = np.isfinite(q).all((1, 2)) & np.isfinite(v).all((1, 2))
     count = int(np.argmin(alive)) if not alive.all() else len(ts)
@@ -117,7 +132,18 @@ def run_record(
 def mode_record(
     mechanism: Mechanism, q: Numbers, shape: Numbers, frequency: float | None, label: str
 ) -> tuple[Record, Float[np.ndarray, "T bodies 3"]]:
-    """Return a mode q + amplitude shape sin(phase), scaled to a visible amplitude, as plain data, and its poses."""
+    """Return the record of a mode q + amplitude shape sin(phase), scaled to a visible amplitude, and its poses in one cycle.
+
+    Args:
+        mechanism: the vibrating mechanism.
+        q: equilibrium coordinates (bodies, 3).
+        shape: mode shape, of any magnitude.
+        frequency: natural frequency (Hz); None to show none.
+        label: label of the mode.
+
+    Raises:
+        ValueError: the shape moves nothing.
+    """
     q, shape = np.asarray(q, float), np.asarray(shape, float).reshape(np.shape(q))
     length = float(analyse(mechanism).length)
     largest = np.max(np.abs(shape) / [length, length, 1.0])
@@ -142,7 +168,7 @@ def mode_record(
 
 
 def _events_of(solution: ShownMotion) -> list[JsonObject]:
-    """Return the events of a run in order of time."""
+    """Return the events {t, name} of a run in order of time; [] for a run without events."""
     events = getattr(solution, "events", None)
     if events is None:
         return []
@@ -151,12 +177,12 @@ def _events_of(solution: ShownMotion) -> list[JsonObject]:
 
 
 def stuck_at(record: Record, t: float) -> list[list[float]]:
-    """Return the anchors of the joints of a run that stick at a time."""
+    """Return the anchors [body, x, y] of the joints of a run that stick at a time (s)."""
     return [joint["at"] for joint in record["sticking"] if any(start <= t <= end for start, end in joint["spans"])]
 
 
 def motion_of(record: Record) -> Callable[[float], Float[np.ndarray, "bodies 3"]]:
-    """Return the coordinates of a run as a function of time, as in the player: cubic between instants; for a mode, a sine."""
+    """Return a function of time for the coordinates of a run, as in the player: cubic between instants; for a mode, a sine."""
     shape = len(record["bodies"]), 3
     if record["mode"]:
         q, swing = (np.reshape(record["mode"][name], shape) for name in ("q", "shape"))
@@ -181,7 +207,7 @@ def _place_in(ts: Float[np.ndarray, "T"], t: float) -> tuple[int, int, float]:
 
 
 def arrows_of(record: Record) -> Callable[[float], list[ForceArrow]]:
-    """Return the arrows of a run's reactions as a function of time, as in the player: linear between instants."""
+    """Return a function of time for the arrows of a run's reactions, as in the player: linear between instants."""
     if not record["reactions"]:
         return lambda t: []
     shown, ts = record["reactions"], unpack(record["time"])[:, 0]
@@ -208,7 +234,7 @@ def paths_of(record: Record) -> list[TracedPath]:
 
 
 def player_data(title: str, runs: Sequence[tuple[Mechanism, Record, Float[np.ndarray, "T bodies 3"]]]) -> Record:
-    """Return the data of the player for runs, or for modes."""
+    """Return the data of the player for runs or for modes, each given by its mechanism, its record and its poses."""
     is_mode = runs[0][1]["mode"] is not None
     ends = [(0.0, 1.0)] if is_mode else [_ends(record) for _, record, _ in runs]
     start, end = min(first for first, _ in ends), max(last for _, last in ends)
@@ -231,10 +257,12 @@ def player_data(title: str, runs: Sequence[tuple[Mechanism, Record, Float[np.nda
 def trace_anchors(
     mechanism: Mechanism, poses: Float[np.ndarray, "T bodies 3"], wanted: Traces | None, length: float
 ) -> list[list[float]]:
-    """Return the anchors whose paths are drawn: those of the named joints and bodies, or of the moving pins.
+    """Return the anchors [body, x, y] whose paths are drawn: the `wanted` joints, bodies and points, or else the moving pins.
+
+    Of these pins, the `MOST_TRACES` with the largest paths are chosen; `length` is the mechanism's characteristic length (m).
 
     Raises:
-        ValueError: a name is neither a body nor a pin.
+        ValueError: a name is neither a body nor a pin, or a point does not move.
     """
     bodies = list(mechanism.bodies)
     if wanted is not None:
@@ -300,7 +328,9 @@ def _ends(record: Record) -> tuple[float, float]:
 
 
 def _speed(duration: float) -> float:
-    """Return speed 1 if it leads to a comfortable playing time, else the nearest speed that does."""
+    """Return the default playback speed for a duration (s): 1 if the playing time is comfortable, else the nearest speed that
+    makes it so.
+    """
     shortest, longest = COMFORTABLE_DURATIONS
     if duration <= 0 or shortest <= duration <= longest:
         return 1.0
@@ -310,7 +340,7 @@ def _speed(duration: float) -> float:
 
 
 def failure_of(solution: ShownMotion) -> str:
-    """Return the cause of a failed run; an empty string for other runs."""
+    """Return the cause of a failed run; "" for other runs."""
     result, cause = getattr(solution, "result", None), getattr(solution, "cause", "")
     if isinstance(result, Result):
         return "" if result.is_success else cause

@@ -1,4 +1,4 @@
-"""Reads runs written by `udkjax simulate` or `Solution.to_xarray`, to show them."""
+"""Reading of runs that `udkjax simulate` or `Solution.to_xarray` has written, to show them."""
 
 import warnings
 from pathlib import Path
@@ -32,7 +32,7 @@ class RunFile(NamedTuple):
 
 
 def read_run(path: Path) -> RunFile:
-    """Read a run (NetCDF).
+    """Return the run in a NetCDF file, with its mechanism.
 
     Raises:
         ValueError: the file does not contain a run, or does not contain the text of its scene.

@@ -22,8 +22,8 @@ def drawn_system(system: ConstrainedSystem, solution: Any, drawing: PlacesBodies
 
     Args:
         system: The system.
-        solution: Its solution: ts (T,), q and v (T, n).
-        drawing: From t and q to x, y (m) and, if the body turns, the angle (rad) of each drawn body, by name.
+        solution: A solution of the system: ts (T,), q and v (T, n).
+        drawing: A function of t and q that returns x, y (m) and, if the body turns, the angle (rad) of each drawn body, by name.
     """
     names = list(drawing(jnp.asarray(solution.ts[0]), jnp.asarray(solution.q[0])))
 

@@ -7,7 +7,7 @@ class MarkKind(StrEnum):
     """The `kind` of a mark, with its further fields and its meaning."""
 
     LINK = "link"  # body, points, closed: a bar through the points at which a body is attached, or a plate around them
-    DISC = "disc"  # body, at, radius: a body without any other mark, as a disc with its radius of gyration
+    DISC = "disc"  # body, at, radius: a body with fewer than two points, as a disc with its radius of gyration
     WHEEL = "wheel"  # body, at, radius, internal, teeth, phase (rad): a gear or a pinion; 0 teeth: as many as fit its size
     OUTLINE = "outline"  # body, at, points: the profile of a cam; its points are relative to `at`
     RAIL = "rail"  # body, at, axis, span, slot: the line of a prismatic joint or a slot, over its used range (m along `axis`)

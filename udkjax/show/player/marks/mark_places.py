@@ -28,7 +28,7 @@ def body_points(mechanism: Mechanism) -> dict[str, Float[np.ndarray, "points 2"]
 
 
 def distinct(points: list[tuple[float, float]]) -> Float[np.ndarray, "points 2"]:
-    """Return the points that differ."""
+    """Return the points without repetitions: of points at the same place, the first."""
     found: list[tuple[float, float]] = []
     size = max((abs(c) for point in points for c in point), default=0.0)
     for point in points:
@@ -38,7 +38,10 @@ def distinct(points: list[tuple[float, float]]) -> Float[np.ndarray, "points 2"]
 
 
 def to_ground(point: Numbers, frames: Float[np.ndarray, "T 3"]) -> Float[np.ndarray, "T 2"]:
-    """Return a point of a body in ground coordinates (m) for each of its frames x, y, angle; or several points for one frame."""
+    """Return the ground coordinates (m) of a point of a body for each frame x, y, angle of the body.
+
+    Several points (n, 2) are converted by a single frame.
+    """
     x, y = np.asarray(point, float).T
     cos, sin = np.cos(frames[:, 2]), np.sin(frames[:, 2])
     return frames[:, :2] + np.column_stack([cos * x - sin * y, sin * x + cos * y])
@@ -47,9 +50,10 @@ def to_ground(point: Numbers, frames: Float[np.ndarray, "T 3"]) -> Float[np.ndar
 def corners_of(
     points: Float[np.ndarray, "points 2"], polygon: Float[np.ndarray, "corners 2"] | None = None
 ) -> tuple[Float[np.ndarray, "corners 2"], bool]:
-    """If the points are in line, return them in order, and False (a bar); else the corners of a plate around them, and True.
+    """Return the shape of a body through points: the points in order and False for a bar, or corners and True for a plate.
 
-    The plate is `polygon` if it contains all corners of the convex hull of the points; else the convex hull.
+    A bar has all points in line. The plate around other points is `polygon` if it contains all corners of their convex hull; else
+    the convex hull.
     """
     from scipy.spatial import ConvexHull  # importing SciPy takes longer than the call
 

@@ -105,7 +105,11 @@ class _Drawing:
             self._force(force)
 
     def links(self) -> list[Mark]:
-        """Return a link for each body with several points, and a disc for each body without any other mark."""
+        """Return the links and discs of bodies.
+
+        A link is drawn through the points of a body; from a single point, it leads to the centre of mass, or to the other end of
+        a uniform rod. Bodies with fewer than two points get a disc, except rods and bodies with another symbol, such as wheels.
+        """
         found: list[Mark] = []
         for body, points in self.points.items():
             if body == GROUND:
@@ -127,7 +131,7 @@ class _Drawing:
         return found
 
     def unmarked(self, traced: Sequence[Sequence[float]], drawn: Sequence[Mark]) -> list[Mark]:
-        """Return marks of the traced points at which no mark is in the first pose."""
+        """Return a mark for each of the `traced` anchors that coincides with no mark in `drawn` in the first pose."""
 
         def place(body: float, at: Numbers) -> np.ndarray:
             return self._path(self._names[int(body)], at)[0]
@@ -223,7 +227,7 @@ class _Drawing:
             self.shaped.add(second)
 
     def add_floor(self, gap: Gap) -> None:
-        """Add the line of a contact, over the range in which its point comes close."""
+        """Add the line of a contact, over the range in which the point of the contact comes close to it."""
         (body, on), margin = gap.bodies, MARGIN * self.size
         nx, ny = np.asarray(gap.normal, float)
         axis = float(np.arctan2(-nx, ny))
@@ -249,13 +253,16 @@ class _Drawing:
             self._mesh(*(pair if pair[1]["phase"] is None else pair[::-1]))
 
     def _teeth(self, name: str) -> list[int]:
-        """Return the numbers of teeth of a pair of wheels; zeros where they are not known."""
+        """Return the numbers of teeth of the two wheels of a gear; [0, 0] if they are not known."""
         drawn = None if self.mechanism.drawing is None else self.mechanism.drawing.groups["gear"].get(name)
         counts = getattr(drawn, "teeth", None)
         return [0, 0] if counts is None else [round(count) for count in np.asarray(counts, float).tolist()]
 
     def _mesh(self, held: Mark, wheel: Mark) -> None:
-        """Turn the teeth of a wheel into the gaps of another one, as the two are first drawn; a meshed wheel is left as it is."""
+        """Set the phase of a wheel so that, in the first pose, its teeth are in the gaps of the wheel `held`.
+
+        A wheel that already has a phase keeps it.
+        """
         held["phase"] = held["phase"] or 0.0
         if wheel["phase"] is not None:
             return
@@ -270,7 +277,10 @@ class _Drawing:
         wheel["phase"] = float((towards - 2 * np.pi * other / wheel["teeth"]) % (2 * np.pi / wheel["teeth"]))
 
     def _belt(self, joint: Gear) -> list[tuple[list[float], ...]]:
-        """Return the two strands of the belt between wheels that do not touch, on their carrier; an open one is internal."""
+        """Return the two strands of the belt of a gear, each as two anchors on the carrier; [] for wheels that touch or overlap.
+
+        The belt of an internal gear, which keeps the sense of rotation, is open; any other belt is crossed.
+        """
         radii, carrier = np.asarray(joint.radii, float), self._frames(joint.carrier)[0]
         axles = [self._path(body, self._held_by(body, joint.carrier)["at"])[0] for body in joint.bodies]
         centres = [in_frame(carrier, axle) for axle in axles]
@@ -352,7 +362,7 @@ class _Drawing:
 
 
 def _size(drawing: _Drawing) -> float:
-    """Return the extent of a mechanism's points (m)."""
+    """Return the extent of a mechanism's points and centres of mass in the first pose (m); 1 if it is zero."""
     all_points = [to_ground(point, drawing._frames(body)[:1])[0] for body, points in drawing.points.items() for point in points]
     all_points += [frame[:2] for frame in drawing.poses[0]]
     return float(np.ptp(np.array(all_points), axis=0).max()) or 1.0

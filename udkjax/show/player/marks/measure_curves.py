@@ -47,7 +47,8 @@ class ShownMotion(Protocol):
 class MeasureCurve(NamedTuple):
     """A number over time: its name, unit, and values at the output times; `log` is True for a logarithmic axis.
 
-    `anchors`, if any, are the places [body, x, y] whose speed it is, or the second of which is the corner of its angle.
+    `anchors` are places [body, x, y], by which a page computes the number again: one whose speed it is, or three whose angle it
+    is, with the corner in the middle; they are empty for other numbers.
     """
 
     name: str
@@ -58,9 +59,13 @@ class MeasureCurve(NamedTuple):
 
 
 def measures_of(mechanism: Mechanism, solution: ShownMotion, wanted: Measures, label: str) -> list[MeasureCurve]:
-    """Return the measures of a run: names in `MEASURES`, or other measures as {"name" or "name (unit)": values}.
+    """Return the curves of the measures of a run.
 
-    Values may also be mappings by the label of a run.
+    Args:
+        mechanism: the mechanism of the run.
+        solution: the run.
+        wanted: names in `MEASURES`; or other measures as {"name" or "name (unit)": values}, by label for several runs.
+        label: label of the run.
 
     Raises:
         ValueError: a name is unknown, or values are not one number per output time.
@@ -104,7 +109,7 @@ def _energy(mechanism: Mechanism, solution: ShownMotion) -> list[MeasureCurve]:
 def _rank(mechanism: Mechanism, solution: ShownMotion) -> list[MeasureCurve]:
     """Return the rank of the scaled Jacobian, and the smallest singular value that is nonzero at the largest rank.
 
-    There are none where events have released constraints.
+    Both are NaN where events have released constraints, or where the state is not finite.
     """
     positions, q = RankedPositions(mechanism, determinacy.STATIC_RANK_TOL), np.asarray(solution.q, float)
     ts, q = np.asarray(solution.ts, float).tolist(), q.reshape(len(q), -1)
@@ -126,7 +131,7 @@ def _effort(mechanism: Mechanism, solution: ShownMotion) -> list[MeasureCurve]:
 
 
 def _friction(mechanism: Mechanism, solution: ShownMotion) -> list[MeasureCurve]:
-    """Return the power of all friction together; nothing for a mechanism without friction."""
+    """Return the power of all friction together; [] for a mechanism without friction."""
     names = [name for name, force in mechanism.forces.items() if isinstance(force, Friction)]
     if not names:
         return []
@@ -156,9 +161,10 @@ MEASURES = {
 
 
 def sticking_spans(mechanism: Mechanism, solution: ShownMotion) -> list[JsonObject]:
-    """Return when each joint with set-valued friction sticks: its name, its place as [body, x, y], and spans of time (s).
+    """Return the spans of time in which joints with set-valued friction stick.
 
-    A span begins and ends at the events of its joint, or else at output times. Contacts with friction are left out.
+    Each entry has the name of a joint, its place `at` as [body, x, y], and `spans` of time (s). A span begins and ends at the
+    events of its joint, or else at output times. Contacts with friction are left out.
     """
     ts, events = np.asarray(solution.ts, float), getattr(solution, "events", None)
     happened = {} if events is None else {name: events.of(name) for name in events.names if name}

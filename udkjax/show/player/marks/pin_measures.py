@@ -19,7 +19,7 @@ Placed = tuple[str, str, list[PinAnchor], Float[np.ndarray, "T"]]  # name, unit,
 
 
 def pin_speeds(mechanism: Mechanism, q: Float[np.ndarray, "T bodies 3"], v: Float[np.ndarray, "T bodies 3"]) -> list[Placed]:
-    """Return the speed of each pin that moves (m/s), of free pins of a drawing as well."""
+    """Return the speed (m/s) of each pin that moves, free pins of a drawing included, as name, unit, anchors and values."""
     found, length = [], float(analyse(mechanism).length)
     for name, (body, place) in _moving_pins(mechanism).items():
         k = mechanism.body_names.index(body)
@@ -29,7 +29,10 @@ def pin_speeds(mechanism: Mechanism, q: Float[np.ndarray, "T bodies 3"], v: Floa
 
 
 def transmission_angles(mechanism: Mechanism, q: Float[np.ndarray, "T bodies 3"]) -> list[Placed]:
-    """Return the acute angle (deg) between the links at each pin that transmits motion to an undriven link."""
+    """Return the acute angle (deg) between the links at each pin that transmits motion to an undriven link.
+
+    Each angle has the name, the unit and the anchors of its curve; the second of the three anchors is the corner.
+    """
     found = []
     driven = {body for driver in mechanism.drivers.values() for body in driver.bodies}
     for name, ((one, here, end), (other, _, far)) in transmission_pins(mechanism, driven).items():
@@ -41,7 +44,7 @@ def transmission_angles(mechanism: Mechanism, q: Float[np.ndarray, "T bodies 3"]
 
 
 def _moving_pins(mechanism: Mechanism) -> Mapping[str, tuple[str, Numbers]]:
-    """Return a body of each pin that is not on the ground, and the place of the pin in its frame (m)."""
+    """Return, for each pin that is not on the ground, one of its bodies and the place of the pin in its frame (m)."""
     joined = {name: next(iter(at.items())) for name, at in pins_with_bodies(mechanism).items() if GROUND not in at}
     return joined | ({} if mechanism.drawing is None else dict(mechanism.drawing.free_pins()))
 

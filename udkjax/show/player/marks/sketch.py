@@ -39,14 +39,14 @@ PATH_WIDTH, PATH_TINT = 1.2, 0.4  # width in units of symbols; fraction of the b
 
 
 class TracedPath(NamedTuple):
-    """The path of a point (n, 2) of a body, in metres."""
+    """The path of a point of a body, by the body's index: places (n, 2) on the ground (m)."""
 
     body: int
     points: Float[np.ndarray, "n 2"]
 
 
 class ForceArrow(NamedTuple):
-    """A force on a point (m) of a body: x and y relative to the usual force, and whether it is unique."""
+    """A force on a point (m) of a body, by its index: x and y relative to the usual force, and True if the force is unique."""
 
     body: int
     at: tuple[float, float]
@@ -55,7 +55,10 @@ class ForceArrow(NamedTuple):
 
 
 class View(NamedTuple):
-    """Maps metres to pixels, (x + scale X, y - scale Y), in a picture of width x height px; `pt` is the unit of symbols (px)."""
+    """A map from metres to pixels, (x + scale X, y - scale Y), for a picture of width x height px.
+
+    `pt` is the unit of symbols (px).
+    """
 
     scale: float
     x: float
@@ -66,7 +69,10 @@ class View(NamedTuple):
 
 
 class Line(NamedTuple):
-    """A line through points, open or closed, filled or not; its width is zero if only its fill is drawn."""
+    """A line through points (px), open or closed, filled or not; its width (px) is zero if only its fill is drawn.
+
+    Its layer is the kind of its mark, or another name; "" stands for no stroke or no fill.
+    """
 
     layer: str
     points: np.ndarray
@@ -88,7 +94,7 @@ class Text(NamedTuple):
 
 
 class Circle(NamedTuple):
-    """A circle."""
+    """A circle (px), filled or not; its width is that of its stroke, and "" stands for no stroke or no fill."""
 
     layer: str
     centre: np.ndarray
@@ -99,7 +105,7 @@ class Circle(NamedTuple):
 
 
 def view_of(bounds: Sequence[float], width: int, times: int = 1, has_arrows: bool = False) -> View:
-    """Return the view of a picture that contains `bounds` (left, bottom, right, top, in m), enlarged by `times`.
+    """Return the view of a picture, `width` px wide, that contains `bounds` (left, bottom, right, top in m), enlarged by `times`.
 
     With `has_arrows` the margin has room for the arrow of the usual force.
     """
@@ -119,7 +125,18 @@ def mix(first: str, second: str, t: float) -> str:
 
 
 class Sketch:
-    """The paths and symbols of a mechanism's marks at one pose, from back to front."""
+    """The paths and symbols of a mechanism's marks at one pose as shapes in pixels, from back to front.
+
+    Args:
+        marks: marks of the mechanism.
+        pose: coordinates of its bodies.
+        view: view of the picture.
+        theme: name of a theme in `THEMES`.
+        paths: paths of traced points.
+        arrows: arrows of joint forces.
+        stuck: anchors [body, x, y] of joints that stick, which get a ring.
+        touching: outlines {body, points, radius} of parts of links that touch others.
+    """
 
     def __init__(
         self,
@@ -158,7 +175,7 @@ class Sketch:
         return Line(TOUCHING, places, 2 * radius, colour, colour if is_area else "", closed=is_area)
 
     def _arrow(self, arrow: ForceArrow) -> list[Line]:
-        """Return the shaft and the head of an arrow; empty if it is too short to be seen."""
+        """Return the shaft and the head of an arrow; [] if it is too short to be seen."""
         force, pt = np.array(arrow.force), self.view.pt
         size = float(np.hypot(*force))
         length = ARROW * pt * min(size, LONGEST_ARROW)
@@ -195,7 +212,7 @@ class Sketch:
         return self.anchor(body, x, y), np.array([np.cos(angle), np.sin(angle)]), self.view.scale
 
     def anchor(self, body: float, x: float, y: float) -> np.ndarray:
-        """Return the place (px) of a point (m) of a body."""
+        """Return the place (px) of a point (m) of a body, given by its index; -1 is the ground."""
         place = to_ground((x, y), (np.zeros(3) if body < 0 else self.pose[int(body)])[None])[0]
         return np.array([self.view.x, self.view.y]) + self.view.scale * place * [1, -1]
 

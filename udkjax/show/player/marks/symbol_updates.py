@@ -31,7 +31,14 @@ BodyPoint = tuple[int, float, float]  # index of a body, and a place in its fram
 
 
 def symbol_updates(mechanism: Mechanism, record: Mapping[str, Any], symbols: Sequence[JsonObject], drawn: int) -> JsonObject:
-    """Return the updates of symbols, marks and traces of a run; points of drawn links begin at index `drawn` of the numbers."""
+    """Return the updates of symbols, marks and traces of a run.
+
+    Args:
+        mechanism: the mechanism of the run.
+        record: the record of the run (player_data.py).
+        symbols: the symbols of its marks.
+        drawn: index of the first of the points of drawn links, which follow the other numbers of the scene.
+    """
     indices: Mechanism = _indices(mechanism)
     points = _points(mechanism, indices)
     for body, more in drawn_points(mechanism):
@@ -90,7 +97,7 @@ def _key(body: float, x: float, y: float) -> BodyPoint:
 
 
 def _points(mechanism: Mechanism, indices: Mechanism) -> dict[BodyPoint, tuple[int, int]]:
-    """Return the indices of x and y of the points of elements in the frames of bodies."""
+    """Return the places of elements' points on bodies, each with the indices of its x and y in the vector of all numbers."""
     number = {GROUND: -1, **{name: k for k, name in enumerate(mechanism.body_names)}}
     found: dict[BodyPoint, tuple[int, int]] = {}
     elements = [*mechanism.constraints.values(), *mechanism.forces.values()]
@@ -108,7 +115,7 @@ def _points(mechanism: Mechanism, indices: Mechanism) -> dict[BodyPoint, tuple[i
 
 
 def _radii(mechanism: Mechanism, indices: Mechanism) -> dict[int, tuple[int, float]]:
-    """Return the index and the value of the radius of each wheel, by body."""
+    """Return the radius of each wheel, by the index of its body: its index in the vector of all numbers, and its value."""
     number, found = {name: k for k, name in enumerate(mechanism.body_names)}, {}
     for name, joint in mechanism.joints.items():
         index = indices.joints[name]

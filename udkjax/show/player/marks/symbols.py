@@ -44,7 +44,7 @@ def _circle(frame: list, radius: Sequence[float], fill: str = "", stroke: str = 
 
 
 def _offsets(points: Numbers) -> np.ndarray:
-    """Return points (n, 4) at the mark's own place, with offsets (n, 2) in the unit of symbols."""
+    """Return points (n, 4) at the origin of a frame, shifted by offsets (n, 2) in the unit of symbols."""
     points = np.asarray(points, float)
     return np.hstack([np.zeros_like(points), points])
 
