@@ -212,7 +212,9 @@ def _reason_for_stabilization(equations: AbstractSystem, solver: Any, stabilizat
 
 
 def _stabilized(operation: RunStates, stabilization: Stabilization) -> tuple[RunStates, str]:
-    """Return the operation with a user-defined stabilization, and the reason why it has no machine code; "" if it has."""
+    """Return the operation with a user-defined stabilization, and "".
+
+    If the stabilization has no machine code, return the operation unchanged, and the reason."""
     try:
         return operation.stabilized(stabilization, overridden(stabilization)), ""
     except UnsupportedError as unknown:

@@ -47,7 +47,7 @@ def violation(equations: AbstractSystem, t: Float[ArrayLike, ""], y: Float[Array
 
 
 def project_all(equations: AbstractSystem, ts: Float[Array, "T"], ys: Float[Array, "T 2n"]) -> Float[Array, "T 2n"]:
-    """Return states at many times, each projected to the manifold.
+    """Return states at many times, each projected onto the manifold.
 
     Interpolated states are farther from the manifold than the ends of steps, so they are projected twice.
     """

@@ -142,13 +142,13 @@ class CompiledTerm:
     def measure_motion(
         self, mechanism: Mechanism, x: np.ndarray, origin: float, s: np.ndarray | None = None
     ) -> np.ndarray | None:
-        """Return the measures (K,) of a mechanism's motion by `kinematics`; None if the motion does not reach all values.
+        """Return the measures (K,) along the motion that `kinematics` computes; None if it does not reach all values.
 
         Args:
             mechanism: the mechanism.
-            x: its free numbers and further unknowns (P,).
-            origin: the driver's value from which the span is measured.
-            s: the values of the driver, by default those of the goal.
+            x: its free numbers, then all further unknowns of the design (P,).
+            origin: the driver's value (rad, m) that is added to `s`, but not over a whole turn.
+            s: the driver's values, relative to `origin`, or absolute over a whole turn; by default those of the goal.
         """
         s = np.asarray(self.values(x[None])[0] if s is None else s)
         motion = kinematics(mechanism, self._driver, s if self._turning else s + origin)

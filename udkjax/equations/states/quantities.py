@@ -224,14 +224,14 @@ def efforts(
     """Return the effort of each driver, which acts on the driver's second body along the driven coordinate: -lambda of its row.
 
     Args:
-        mechanism: The scene.
+        mechanism: The mechanism.
         solution: Times and states: anything with ts (T,), q and v (T, bodies, 3); a `Kinematics` as for `reactions`.
         method: The pseudoinverse; by default `SVD`. A redundant driver gets its share of the minimum-norm multipliers.
         stabilization: The run's `Baumgarte`, to include its terms.
 
     Returns:
-        For each driver its torque (N m) along an angle, or force (N) along a length, (T,); NaN where the states are NaN, and
-        zero while an event of a `Solution` has released the driver.
+        By the name of each driver an array (T,): the torque (N m) if it drives an angle, the force (N) if it drives a length; NaN
+        where the states are NaN, and zero while an event of a `Solution` has released the driver.
     """
     mechanism.require_masses("efforts")
     if not mechanism.driver_names:

@@ -5,7 +5,7 @@ applies the events at the present time, and, if joints may stick, `begin`, which
 the address of a block of numbers (native/wasm/hosted.py), and ask their host about a state:
 
     look        the conditions, with their rates, slopes, directions of impulses and forces
-    project     q and v projected to the constraints of the phase, and the violation that is left
+    project     q and v projected onto the constraints of the phase, and the violation that is left
 """
 
 from collections.abc import Callable, Mapping
@@ -157,7 +157,7 @@ class InstantMotion:
         return self._of.values.values(self._ask("look", at)[None], jnp)
 
     def project(self, members: MemberIndices, at: RunState, is_free: bool = False) -> tuple[Array, Array, Array]:
-        """Return q and v projected to the constraints of the phase, and the largest remaining |Psi_dot_i| over its scale."""
+        """Return q and v projected onto the constraints of the phase, and the largest remaining |Psi_dot_i| over its scale."""
         found, n = self._ask("project", at)[None], self._of.n
         return found[:, :n], found[:, n:-1], found[:, -1]
 

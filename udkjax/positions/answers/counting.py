@@ -19,14 +19,14 @@ DRAWN = 1e-10  # relative to the largest: smaller is rounding of a drawing's num
 
 
 class Count(NamedTuple):
-    """The scale on which a driver's values are shown and read: the shown number is (value + offset) / size.
+    """The scale on which a driver's values, or the times of a run, are shown and read: the number is (value + offset) / size.
 
     Attributes:
-        offset: the angle or length (rad, m) that is added to the driver's value.
-        size: the shown unit in rad, m or s.
+        offset: the angle, length or time (rad, m, s) that is added to the value.
+        size: the size of the shown unit in rad, m or s.
         unit: the name of the shown unit.
-        words: a phrase with the counted quantity and its zero, such as "the angle of A-B from the x axis".
-        units: the units of the drawing, for texts and plain numbers.
+        words: a phrase that names the quantity and where it is measured from, such as "the angle of A-B from the x axis".
+        units: the units of the drawing, in which other quantities are shown, and numbers without a unit are read.
     """
 
     offset: float

@@ -184,7 +184,10 @@ class LawProfile(AbstractProfile):
         return clockwise if self.clockwise else -clockwise
 
     def bearing(self, turn: Number, flat: bool = False) -> Number:
-        """Return the angle of the follower in the cam's frame (rad) when the cam has turned by this angle (rad)."""
+        """Return the polar angle in the cam's frame (rad) of the follower's point, or, if `flat`, of the normal of its face.
+
+        `turn` (rad) is the angle by which the cam has turned.
+        """
         return self._start + self.sight(self(turn, flat), flat) + (turn if self.clockwise else -turn)
 
     @property

@@ -100,7 +100,7 @@ class AbstractDrawing(PrintsTable):
     @property
     @abstractmethod
     def groups(self) -> Mapping[str, Mapping[str, eqx.Module]]:
-        """The elements that hold the drawing's numbers, by section and name."""
+        """The drawing's own elements by section (number, pin, link, motor, ...) and name, with the numbers of expressions."""
 
     @property
     @abstractmethod

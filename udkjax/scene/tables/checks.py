@@ -47,11 +47,11 @@ class Mistakes(ValueError):
 
 
 class SceneError(Mistakes):
-    """An error for a scene that contains mistakes. `problems` lists all of them, each with the path of its entry.
+    """An error for a mechanism or a scene file that contains mistakes.
 
     Attributes:
-        problems: all mistakes, each with the path of its entry.
-        source: the name of the mechanism or of the file.
+        problems: a message for each mistake, which begins with the path of the entry if it concerns one.
+        source: the name of the mechanism or of the file; empty if there is none.
     """
 
     subject = "scene"

@@ -236,9 +236,11 @@ def _carried(system: System, members: MemberIndices, carried: Bool[Any, "b E"], 
 def _may_follow(
     system: System, values: ConditionValues, watched: Bool[Any, "b E"], closed: Int[Any, "b E"], settled: Bool[Any, "b E"]
 ) -> Bool[Any, "b"]:
-    """Return a mask of the members whose event may cause another at once: a condition is zero, or depends on velocities.
+    """Return a mask of the members whose event may cause another one at the same instant.
 
-    Joints with set-valued friction are left out: a single decision covers every joint at rest.
+    A condition depends on velocities, or a watched one is zero, not `settled`, and of no closed contact. `closed` are the states
+    of contacts at the event (OPEN, TOUCHES, SLOW); `settled` marks an event that changes nothing. Joints with set-valued friction
+    are left out: a single decision covers every joint at rest.
     """
     unclear = watched & ~settled & (closed == OPEN) & (system.xp.abs(values.h) <= ZERO * values.scale)
     return system.xp.any((unclear | system.plan.follows_velocity) & ~system.plan.slides, axis=-1)

@@ -65,7 +65,7 @@ class System(Protocol):
     def project(
         self, members: MemberIndices, at: RunState, is_free: bool = False
     ) -> tuple[Float[Any, "b n"], Float[Any, "b n"], Float[Any, "b"]]:
-        """Return q and v projected to the constraints of their phases, and the largest remaining |Psi_dot_i| over its scale."""
+        """Return q and v projected onto the constraints of their phases, and the largest remaining |Psi_dot_i| over its scale."""
         ...
 
     def add_joints(self, members: MemberIndices, new: Bool[Any, "b A"], q: Float[Any, "b n"], joints: Any) -> Any:

@@ -305,7 +305,7 @@ class PhaseCode:
         return self._values
 
     def project(self, members: Int[np.ndarray, "b"], state: RunState) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return q and v of members, projected to the constraints of their phases, and the largest remaining |Psi_dot_i|."""
+        """Return q and v of members, projected onto the constraints of their phases, and the largest remaining |Psi_dot_i|."""
         t, q, v, *_ = state
         n = q.shape[1]
         further = _of(self._of_states, members), _of(self._rows, members), np.zeros((1, 0))

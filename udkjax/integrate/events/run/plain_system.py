@@ -63,7 +63,7 @@ class PlainSystem:
         return jax.tree.map(lambda x: x[None], self.hybrid.values(without_member(at), is_free, is_directed, has_forces))
 
     def project(self, members: MemberIndices, at: RunState, is_free: bool = False) -> tuple[Array, Array, Array]:
-        """Return q and v projected to the constraints of the phase, and the largest remaining |Psi_dot_i| over its scale."""
+        """Return q and v projected onto the constraints of the phase, and the largest remaining |Psi_dot_i| over its scale."""
         hybrid = self.hybrid
         # A replay without joints that move bodies as they are attached corrects nothing: one step has all derivatives.
         steps = 1 if hybrid.replays and hybrid.plan.has_only_contacts else 2

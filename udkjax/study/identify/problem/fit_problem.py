@@ -119,7 +119,10 @@ class FitProblem:
         return np.concatenate([group, np.full(self.extra_rows, -1)])
 
     def by_record(self, rows: Float[np.ndarray, "R"]) -> tuple[dict[str, np.ndarray], ...]:
-        """Return a table of numbers (R,) for each record: by channel, at the record's times, NaN where nothing was measured."""
+        """Return `rows`, a number for each measured value (R,), as a table for each record.
+
+        A table has an array (times,) for each channel with finite numbers, which is NaN where nothing was measured.
+        """
         table = np.full(self.y.shape, np.nan)
         table[self.present] = rows
         tables = []
