@@ -111,7 +111,7 @@ class MachineSystem:
         return StateValues(*self._by_phase(members, at, PhaseCode.at))
 
     def project(self, members: MemberIndices, at: RunState, is_free: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return q and v projected onto the constraints of their phases, and for each member the largest |Psi_dot_i| left, per scale."""
+        """Return q and v projected onto the constraints of their phases, and the largest |Psi_dot_i| left, per scale (b,)."""
         q, v, left = self._by_phase(members, at, PhaseCode.project)
         return q, v, left
 
