@@ -134,9 +134,23 @@ def require_choice(name: str, value: Any, choices: Sequence[str]) -> None:
 
 
 def require_function(name: str, value: Any, arguments: str) -> None:
-    """Require a function or another callable object, but not a class; `arguments` describes its arguments, for messages."""
+    """Require a function or another callable object, but not a class.
+
+    Args:
+        name: the name of the argument, for messages.
+        value: the argument.
+        arguments: the arguments that the function is called with, such as "(t, q)", or a phrase for a single one.
+    """
     if not callable(value) or isclass(value):
         raise ArgumentTypeError(f"{name} must be a function {arguments}, {describe(value)}")
+    try:
+        own = signature(value)
+    except (TypeError, ValueError):  # of some functions written in C
+        return
+    try:
+        own.bind(*arguments.split(","))
+    except TypeError:
+        raise ArgumentTypeError(f"{name} must be a function {arguments}, not of {own}") from None
 
 
 def require_count(name: str, value: Any, least: float = 1, given: GivenArguments = NOTHING) -> None:

@@ -291,3 +291,45 @@ def test_an_input_that_is_no_constant_is_refused():
     with pytest.raises(TypeError, match=r"inputs\['force.motor.value'\] is a Held"):
         held: Any = udk.Held([1.0, 2.0], 0.1)
         udk.step(mechanism, udk.assemble(mechanism), {"force.motor.value": held}, 0.1)
+
+
+def rubbing(law="set-valued", **more) -> udk.Mechanism:
+    """A block of 1 kg on a rail along x, with a coefficient of friction of 0.3."""
+    block, rail = {"block": udk.Body(1.0, 0.1, velocity=(1.0, 0.0))}, udk.Prismatic(("ground", "block"), np.zeros((2, 2)), 0.0)
+    return udk.Mechanism(block, {"S": rail}, forces={"rub": udk.Friction("S", coefficient=0.3, law=law), **more})
+
+
+def test_steps_stick_and_slip_as_runs_do():
+    """Eager, compiled and in loops: a block stops after v^2 / (2 mu g), and a force below the static limit does not move it."""
+    mech, way = rubbing(), 1 / (2 * 0.3 * 9.81)
+    start, states = udk.assemble(mech), []
+    for step in (udk.step, jax.jit(udk.step, static_argnums=2)):
+        state = start
+        for _ in range(5):
+            state = step(mech, state, None, 0.1)
+        states.append(state)
+    scanned, _ = jax.lax.scan(lambda state, _: (udk.step(mech, state, None, 0.1), None), start, length=5)
+    for state in (*states, scanned):
+        assert_allclose([state.q[0, 0], state.v[0, 0]], [way, 0.0], rtol=0, atol=1e-9)
+    sticky = udk.Friction("S", coefficient=0.3, static_coefficient=0.5, law="set-valued")
+    pulled = rubbing(rub=sticky, pull=udk.Force("block", [4.0, 0.0]))  # 0.3 and 0.5 of the weight are 2.9 and 4.9 N
+    still = udk.State(start.q, 0.0 * start.v)
+    assert_allclose(udk.step(pulled, still, None, 1.0).q, start.q, rtol=0, atol=1e-12)
+    moved = udk.step(pulled, still, {"force.pull.vector": [6.0, 0.0]}, 1.0, t=2.0).q[0, 0]
+    assert_allclose(moved, 0.5 * (6.0 - 0.3 * 9.81), rtol=1e-9)
+
+
+def test_steps_have_the_derivatives_of_runs_through_sticking():
+    """The way to rest is v^2 / (2 mu g); a pull that does not move the block has the derivative zero."""
+    mech = rubbing(pull=udk.Force("block", [0.0, 0.0]))
+
+    def end(x):
+        moved = mech.with_parameters({"force.rub.coefficient": x[0]})
+        return udk.step(moved, udk.assemble(moved), {"force.pull.vector": jnp.stack([x[1] * 0, x[1]])}, 0.5).q[0, 0]
+
+    wanted = np.array([-1 / (2 * 0.3**2 * 9.81), 1 / (2 * 0.3 * 9.81**2)])  # a pull up makes the block lighter
+    for slope in (jax.jit(jax.grad(end)), jax.jacfwd(end)):
+        assert_allclose(slope(jnp.array([0.3, 0.0])), wanted, rtol=1e-6)
+    still = udk.assemble(mech)
+    along = jax.grad(lambda f: udk.step(mech, udk.State(still.q, 0 * still.v), {"force.pull.vector": [f, 0.0]}, 0.5).q[0, 0])
+    assert along(1.0) == 0.0

@@ -149,3 +149,18 @@ def test_a_motion_without_accelerations_is_refused():
     motion = udk.kinematics(mech, None, ts)
     with pytest.raises(ValueError, match=r"motion.a must have the shape of motion.q, \(3, 1, 3\), not \(1, 3\)"):
         udk.inverse_dynamics(mech, ts, eqx.tree_at(lambda m: m.a, motion, motion.a[0]))
+
+
+def test_what_is_fed_forward_is_traced_as_other_functions_are():
+    """A heavier pendulum needs more torque: its motion, eagerly, in jit and in lanes."""
+    mech, ts = udk.library.driven_pendulum(), np.linspace(0.0, 0.2, 5)
+    (mass,) = (name for name in mech.parameters() if name.endswith(".mass"))
+
+    def torque(factor):
+        heavy = mech.with_parameters({mass: factor * mech.parameters()[mass]})
+        (effort,) = udk.feed_forward(heavy, udk.inverse_dynamics(heavy, ts)).forces.values()
+        return effort.law(0.1)
+
+    one, two = torque(1.0), torque(2.0)
+    np.testing.assert_allclose(jax.jit(jax.vmap(torque))(np.array([1.0, 2.0])), [one, two], rtol=1e-12)
+    assert abs(two - one) > 0.1 * abs(one)

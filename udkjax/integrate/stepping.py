@@ -20,7 +20,7 @@ from udkjax.equations.rows.analysis import Analysis, analysis_of
 from udkjax.equations.systems.general import ConstrainedSystem
 from udkjax.integrate.compiled_mechanism import compile_mechanism
 from udkjax.integrate.derivatives import differentiable
-from udkjax.integrate.prepare import AUTO, DRIFT_PROJECTED, Choices, prepare_run
+from udkjax.integrate.prepare import AUTO, DRIFT_PROJECTED, Choices, may_stick, prepare_run
 from udkjax.integrate.projection import Projection
 from udkjax.integrate.simulate import simulate
 from udkjax.positions.assembling.assembly import State
@@ -54,7 +54,9 @@ def step(
 
     For `jax.lax.scan`, jit, vmap and grad: all numbers may be traced. The integrator chooses its steps within the interval;
     the first step tried is the whole interval. The state is not assembled: projection keeps states on the constraints, so begin
-    with a state from `assemble`. If all inputs are known beforehand, `simulate` with a `Held` is faster.
+    with a state from `assemble`. If all inputs are known beforehand, `simulate` with a `Held` is faster. With set-valued
+    friction an interval is a run with events, in which joints stick and slip: it takes milliseconds, and has first derivatives,
+    but none with respect to t and dt.
 
     Args:
         mechanism: the mechanism, or a `ConstrainedSystem`, whose functions hold the inputs.
@@ -84,6 +86,8 @@ def step(
             cure = "make a ConstrainedSystem of functions that hold the inputs of the interval"
             mechanism.require_bodies(f"inputs are for mechanisms: {cure}")
         moved = mechanism.traced(np.size(state.q))
+    if may_stick(mechanism):
+        return _step_with_events(mechanism, state, _checked_inputs(inputs), dt, t, rtol, atol, max_steps, analysis, engine)
     values, others = _checked_inputs(inputs), {"dt": dt, "t": t, "rtol": rtol, "atol": atol}
     if not is_concrete(moved, analysis) or is_traced((state.q, state.v, values, others)):
         analysis, has_fixed_times = analysis or analysis_of(moved), not is_traced((t, dt))
@@ -94,13 +98,32 @@ def step(
         return _advance_at_once(moved, analysis, state, values, others, max_steps, engine, has_fixed_times)
     run = _steps_of(moved, analysis, *values).program(moved, values, np.shape(state.q), max_steps, engine)
     q, v = run(state, values, others)
-    if not np.isfinite(np.asarray(q)).all():
-        ts = np.asarray(t, float) + np.array([0.0, 1.0]) * np.asarray(dt, float)
-        tolerances: Any = {"rtol": rtol, "atol": atol, "dt0": dt, "max_steps": max_steps}
-        given = moved.with_parameters(values) if values else mechanism
-        run = simulate(given, ts, state, **tolerances, engine=engine)  # raises, with the cause
-        return State(run.q[-1], run.v[-1])
+    if not np.isfinite(np.asarray(q)).all():  # raises, with the cause
+        given = moved if values else mechanism
+        return _step_with_events(given, state, values, dt, t, rtol, atol, max_steps, analysis=None, engine=engine)
     return make_module(State, q=q, v=v)
+
+
+def _step_with_events(
+    mechanism: Any,
+    state: State,
+    values: Mapping[str, Numbers],
+    dt: NumberLike,
+    t: NumberLike,
+    rtol: NumberLike,
+    atol: NumberLike,
+    max_steps: int,
+    analysis: Analysis | None,
+    engine: Literal["auto", "native", "diffrax", "jax"],
+) -> State:
+    """Return the state after an interval as a run by `simulate`, which locates where joints stick and slip."""
+    given = mechanism.with_parameters(values) if values else mechanism
+    xp = jnp if is_traced((t, dt)) else np
+    start, length = xp.asarray(t, float), xp.asarray(dt, float)
+    ts = xp.stack([start, start + length])
+    tolerances: Any = {"rtol": rtol, "atol": atol, "dt0": dt, "max_steps": max_steps}
+    run = simulate(given, ts, state, **tolerances, analysis=analysis, engine=engine)
+    return State(run.q[-1], run.v[-1])
 
 
 def _checked_inputs(inputs: Any) -> dict[str, Any]:

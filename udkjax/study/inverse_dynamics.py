@@ -26,7 +26,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from udkjax.annotations import NumberLike
@@ -257,7 +256,7 @@ def feed_forward(mechanism: Mechanism, found: InverseDynamics) -> Mechanism:
         ValueError: an effort is undetermined at some time.
     """
     mechanism.require_masses("efforts")
-    if not isinstance(found.ts, Tracer) and not np.all(found.determined):
+    if not is_traced((found.ts, found.determined)) and not np.all(found.determined):
         t = float(found.ts[int(np.argmin(found.determined))])
         raise ValueError(
             f"the efforts of the drivers are not determined at {t:g} s: leave out the times where `found.determined` is False"

@@ -417,3 +417,17 @@ def test_a_long_chain_in_space_swings_in_its_plane_as_a_planar_one():
     one = lambda spin: places(spin)[-1, -1, 1]  # noqa: E731
     slope = (one(0.3 + 1e-4) - one(0.3 - 1e-4)) / 2e-4
     assert_allclose([jax.jacfwd(one)(0.3), jax.grad(one)(0.3)], slope, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("functions", "message"),
+    [
+        ({"constraint": lambda q: q}, r"constraint must be a function \(t, q\), not of \(q\)"),
+        ({"force": lambda t, q: q}, r"force must be a function \(t, q, v\), not of \(t, q\)"),
+        ({"mass": np.eye(2)}, r"mass must be a function \(q\), not an? ndarray"),
+        ({"q0": np.zeros(2), "v0": np.zeros(3)}, r"v0 must have the shape of q0, \(2,\); it has the shape \(3,\)"),
+    ],
+)
+def test_functions_that_do_not_fit_are_named(functions, message):
+    with pytest.raises((TypeError, ValueError), match=message):
+        udk.ConstrainedSystem(**{"mass": lambda q: jnp.eye(2)} | functions)

@@ -24,9 +24,18 @@ from udkjax.equations.terms.scale_program import RANK_TOL
 from udkjax.pinv import Auto, Elimination, Plus, Pseudoinverse
 from udkjax.pinv.rank_policy import RankPolicy
 from udkjax.printing import PrintsLine
+from udkjax.requirements import ArgumentError, require_function
 from udkjax.scene.model import Model
 from udkjax.scene.numbers.number_fields import NumberField
 
+# The functions of a `ConstrainedSystem`, with their arguments.
+ARGUMENTS = {
+    "mass": "(q)",
+    "force": "(t, q, v)",
+    "constraint": "(t, q)",
+    "velocity_constraint": "(t, q, v)",
+    "potential": "(t, q)",
+}
 ConstraintRows = TypeAliasType("ConstraintRows", Float[ArrayLike, "m"] | Mapping[str, ArrayLike])  # also by name
 
 
@@ -60,8 +69,13 @@ class ConstrainedSystem(PrintsLine, Model):
     v0: Vector | None = eqx.field(converter=number_called("v0", optional=True), default=None)
 
     def __post_init__(self):
+        for name, arguments in ARGUMENTS.items():
+            if (function := getattr(self, name)) is not None:
+                require_function(name, function, arguments)
         if self.q0 is not None and self.v0 is None:
             self.v0 = number(np.zeros(np.shape(self.q0)))
+        if self.q0 is not None and np.shape(self.v0) != np.shape(self.q0):
+            raise ArgumentError(f"v0 must have the shape of q0, {np.shape(self.q0)}; it has the shape {np.shape(self.v0)}")
 
     @classmethod
     def of_energy(

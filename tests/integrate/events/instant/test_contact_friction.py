@@ -79,6 +79,22 @@ def test_plate_slides_and_sticks():
     assert solution.events.of("foot -0.5 sticks") == pytest.approx([stop], abs=1e-11)
 
 
+@pytest.mark.parametrize("restitution", [0.0, 0.5])
+@pytest.mark.parametrize("speed", [-5.0, 5.0])
+def test_feet_act_on_each_other_by_their_friction(speed, restitution):
+    """Also where their normal impulses do not, at centres of percussion: both feet hit together, and the plate does not turn."""
+    floor = {"restitution": restitution, "coefficient": 0.3}
+    found = []
+    for inertia in (0.01, 0.0100001):  # of a plate of 1 kg with feet 0.1 m beside the centre
+        body = udk.Body(1.0, inertia, [0.0, 0.3], velocity=[speed, 0.0])
+        feet = [udk.Contact("plate", [x, -0.1], name=f"foot {x}", **floor) for x in (-0.1, 0.1)]
+        found.append(udk.simulate(udk.Mechanism({"plate": body}), [0.0, 0.21], events=feet, **TOL).events)
+    for events in found:
+        fall = np.sqrt(2 * G * 0.2)
+        after = [speed - np.sign(speed) * 0.3 * (1 + restitution) * fall, restitution * fall, 0.0]
+        np.testing.assert_allclose(events.v_after[0, 0], after, rtol=1e-9, atol=1e-9)
+
+
 def test_mistakes():
     mechanism, _ = plate(1.0)
     mistakes: list[dict[str, Any]] = [{"coefficient": -0.1}, {"static_coefficient": 0.1}, {"coefficient": 0.1, "at_rest": "stop"}]

@@ -44,6 +44,13 @@ from udkjax.integrate.events.law.event import listed_events
         (udk.Event(lambda t, at: at["link"].x, udk.Impact(1.5)), "restitution must be from 0 to 1, not 1.5"),
         (udk.Event(lambda t, at: at["link"].x, udk.Release("C")), 'no joint or driver named "C"'),
         (udk.Event(lambda t, at: jnp.ones(2)), r"must return one number, not an array of shape \(2,\)"),
+        (udk.Event(lambda t, at: None), 'event "event1": the condition must return one number, not None'),
+        (
+            udk.Event(lambda t, at: at["link"].y < -0.3),
+            "must return a real number, not one of the type bool: return the difference",
+        ),
+        (udk.Event(lambda t, at: at["link"].y * 1j), "must return a real number, not one of the type complex"),
+        (udk.Event(lambda t: t), r"the condition must be a function \(t, frames\), not of \(t\)"),
         ([udk.Contact("link"), udk.Contact("link")], "two events have this name"),
         ([], "the list is empty"),
         ([1.0], r"events\[0\]: must be an Event"),

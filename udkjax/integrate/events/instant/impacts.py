@@ -230,7 +230,11 @@ def contact_states(
     unit, impacts, is_own = scale * system, contacts.impacts, np.arange(E) == (k % E)[..., None]
     closed = impacts & (held | ((xp.abs(h) <= CLOSED * scale) & (rate <= ZERO_RATE * unit)) | is_own)
     size = xp.sqrt(diagonal(W, xp))
-    acts = (xp.abs(W) > COUPLED * size[..., None, :] * size[..., :, None]) & closed[..., None, :] & closed[..., :, None]
+    acts = xp.abs(W) > COUPLED * size[..., None, :] * size[..., :, None]
+    # A contact with friction acts by the row of its sliding, too, though its normal impulse may leave the other contact alone.
+    sliding = np.where(contacts.tangents >= 0, contacts.tangents, np.arange(E))
+    acts = acts | acts[..., sliding, :]
+    acts = (acts | acts[..., sliding]) & closed[..., None, :] & closed[..., :, None]
     joined = is_own | ((k < E) & ~xp.asarray(impacts)[k % E])[..., None]
     for _ in range(int(np.sum(impacts)) - 1):
         joined = joined | xp.any(acts & joined[..., None, :], axis=-1)

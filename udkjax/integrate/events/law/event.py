@@ -344,5 +344,12 @@ def _try_condition(event: Event, mechanism: Any, where: str) -> None:
     if not has_traced and isinstance(value, Tracer):  # derivatives with respect to the traced numbers would be lost
         cure = "make it an equinox module that holds them and has a `__call__`"
         raise ValueError(f"{where}: the condition closes over traced numbers; {cure}")
+    try:
+        kind = jnp.asarray(value).dtype
+    except (TypeError, ValueError):
+        raise ArgumentTypeError(f"{where}: the condition must return one number, {describe(value)}") from None
     if shape := np.shape(value):
         raise ValueError(f"{where}: the condition must return one number, not an array of shape {shape}")
+    if not jnp.issubdtype(kind, jnp.floating) and not jnp.issubdtype(kind, jnp.integer):
+        cure = "return the difference of both sides of a comparison, which passes zero where the comparison changes"
+        raise ValueError(f"{where}: the condition must return a real number, not one of the type {kind}: {cure}")
