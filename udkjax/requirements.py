@@ -207,13 +207,15 @@ def concrete_only(instead: str = "") -> Callable[[Callable[Arguments, Result]], 
 
     def decorate(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
         parameters = signature(function)
+        called = function.__qualname__.removesuffix(".__init__").rpartition(".")[2]  # of a method, or a class
         cure = f"under jit and vmap use {instead}" if instead else "call it outside of jit, vmap and grad"
 
         @wraps(function)
         def call(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
             for name, value in parameters.bind(*args, **kwargs).arguments.items():
                 if _has_traced_numbers(value):
-                    problem = f"{name} must be concrete, not traced: {function.__name__} needs concrete numbers"
+                    subject = f"the {type(value).__name__}" if name == "self" else name
+                    problem = f"{subject} must be concrete, not traced: {called} needs concrete numbers"
                     raise ArgumentTypeError(f"{problem}; {cure}")
             with jax.ensure_compile_time_eval() if is_within_jit() else nullcontext():
                 return function(*args, **kwargs)

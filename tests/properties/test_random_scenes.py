@@ -308,13 +308,26 @@ def test_every_argument_of_a_wrong_kind_is_named(name):
     assert not found, found
 
 
-def test_traced_mechanisms_are_refused_by_functions_of_concrete_numbers():
-    def traced(function: Any, given: dict[str, Any], mass: Any) -> Any:
-        return function(**(given | {"mechanism": given["mechanism"].with_parameters({"body.b.mass": mass})}))
+def traced(function: Any, given: dict[str, Any], mass: Any) -> Any:
+    found = function(**(given | {"mechanism": given["mechanism"].with_parameters({"body.b.mass": mass})}))
+    return [x for x in jax.tree.leaves(found) if isinstance(x, jax.Array)]
 
+
+def test_traced_mechanisms_are_refused_by_functions_of_concrete_numbers():
     for name in ("branches", "check", "equilibria", "identify", "check_gradients", "design_experiment", "sweep"):
         with pytest.raises(TypeError, match=f"^mechanism must be concrete, not traced: {name} "):
             jax.eval_shape(functools.partial(traced, *FUNCTIONS[name]), 1.0)
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_every_function_traces_or_refuses_traced_numbers(name):
+    """No error of JAX itself reaches the user."""
+    try:
+        jax.eval_shape(functools.partial(traced, *FUNCTIONS[name]), 1.0)
+    except jax.errors.JAXTypeError as error:
+        pytest.fail(str(error))
+    except (TypeError, ValueError) as error:
+        assert type(error).__module__.startswith("udkjax"), error
 
 
 def test_a_folder_is_no_file_to_write(tmp_path, monkeypatch, capsys):

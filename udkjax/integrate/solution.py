@@ -17,6 +17,7 @@ from udkjax.equations.states.quantities import efforts
 from udkjax.equations.states.scene_changes import SceneChanges
 from udkjax.extras import OptionalImport
 from udkjax.printing import PrintedTable, PrintsTable, PrintsWords, units
+from udkjax.requirements import concrete_only
 from udkjax.scene.elements.bodies import COORDINATES, Frame, frame_over_time
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.numbers.description import format_pose, size_of
@@ -214,6 +215,7 @@ class Solution(PrintsTable):
         """Return the path (m) of a point given in the body's own frame (m). `udkjax.path` also supports pins and velocities."""
         return jnp.stack(self.frame(body).point(number(point)), -1)
 
+    @concrete_only()
     def to_xarray(self, mechanism: Mechanism | None = None) -> Any:
         """Return an xarray Dataset: q and v over time, body and coordinate, units, versions, settings, result and statistics.
 

@@ -11,7 +11,7 @@ from udkjax.annotations import Numbers
 from udkjax.argument_types import COUNT, NOT_NEGATIVE_COUNT
 from udkjax.positions.following.drive import Drive, only_driver
 from udkjax.positions.following.free_numbers import FreeNumbers
-from udkjax.requirements import require_count, require_number
+from udkjax.requirements import concrete_only, require_count, require_number
 from udkjax.scene.arguments import checked
 from udkjax.scene.drawing import Drawing
 from udkjax.scene.mechanism import Mechanism
@@ -140,6 +140,7 @@ def search(problem: DesignProblem, state: SearchState, threads: int | None) -> S
 
 
 @checked
+@concrete_only()
 def design(
     drawing: Drawing | Mechanism,
     goal: Goal | Sequence[Goal | MotionTerm],

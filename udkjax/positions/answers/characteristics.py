@@ -13,6 +13,7 @@ from udkjax.positions.answers.turning_points import Combination, Cycle, Measured
 from udkjax.positions.assembling.coordinates import Coordinate, element_of
 from udkjax.positions.following.drive import Drive, only_driver
 from udkjax.printing import PrintedTable, PrintsTable, format_number
+from udkjax.requirements import concrete_only
 from udkjax.scene.arguments import checked
 from udkjax.scene.elements.bodies import GROUND
 from udkjax.scene.elements.couplings import Gear
@@ -130,6 +131,7 @@ def _numbered(title: str, k: int, count: int) -> str:
 
 
 @checked
+@concrete_only()
 def characteristics(mechanism: Mechanism, driver: Drive = None) -> Characteristics:
     """Return the characteristics of a mechanism: type, mobility, strokes, dead points, transmission, ratios.
 

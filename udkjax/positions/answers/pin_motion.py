@@ -17,7 +17,7 @@ from udkjax.positions.assembling.coordinates import value_of
 from udkjax.positions.following.drive import Drive, constant_speed, only_driver
 from udkjax.positions.following.kinematics import Kinematics, kinematics
 from udkjax.printing import PRINTED_AS_ZERO, PrintedTable, PrintsTable, fields_table, format_number, has_numbers, units
-from udkjax.requirements import GivenArguments, require_finite
+from udkjax.requirements import GivenArguments, concrete_only, require_finite
 from udkjax.scene.arguments import checked
 from udkjax.scene.elements.bodies import GROUND
 from udkjax.scene.elements.joints import Revolute
@@ -207,6 +207,7 @@ def _point_motion(motion: Kinematics, body: str, local: Array) -> Float[Array, "
 
 
 @checked
+@concrete_only()
 def motion_at(
     mechanism: Mechanism,
     at: NumberLike | str | Sequence[float | str],

@@ -14,6 +14,7 @@ from udkjax.positions.assembling.channels import StateHistory
 from udkjax.positions.assembling.coordinates import Coordinate, value_of
 from udkjax.positions.following.drive import Drive, only_driver
 from udkjax.programs.deferred import deferred
+from udkjax.requirements import concrete_only
 from udkjax.scene.arguments import checked
 from udkjax.scene.elements.bodies import GROUND
 from udkjax.scene.elements.joints import Cam
@@ -25,6 +26,7 @@ RANK = 1e3 * ROUNDING  # relative to the largest singular value: motions with le
 
 
 @checked
+@concrete_only()
 def pressure_angle(
     mechanism: Mechanism, motion: Annotated[StateHistory, HISTORY], cam: str, driver: Drive = None
 ) -> Float[np.ndarray, "T"]:

@@ -15,7 +15,7 @@ from udkjax.native.language.program import UnsupportedError
 from udkjax.positions.following.drive import Drive, Driven, drive
 from udkjax.positions.following.free_numbers import FreeNumbers, position_model
 from udkjax.printing import PrintedTable, PrintsTable, prints_table, units
-from udkjax.requirements import require_finite
+from udkjax.requirements import concrete_only, require_finite
 from udkjax.scene.arguments import checked
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.tables.checks import SceneError
@@ -72,6 +72,7 @@ class PositionBatch:
     """
 
     @checked
+    @concrete_only()
     def __init__(self, mechanism: Mechanism, driver: Drive, free: Sequence[str], derivatives: bool = False):
         self.free = FreeNumbers(mechanism, free)
         self._driven = drive(mechanism, driver)

@@ -16,6 +16,7 @@ from udkjax.integrate.events.law.conditions import Gap
 from udkjax.integrate.events.law.event import EventsLike, ExpandsToEvents, expand_events, listed_events
 from udkjax.integrate.simulate import simulate
 from udkjax.positions.gaps.gaps import LeastGaps
+from udkjax.requirements import concrete_only
 from udkjax.scene.arguments import checked, require_mechanism
 from udkjax.scene.mechanism import Mechanism
 from udkjax.show.player import pictures
@@ -179,6 +180,7 @@ class Animation:
         return f'<Animation of {data["title"]!r}: {len(runs)} {"run" if len(runs) == 1 else "runs"}, {what}; save("motion.html")>'
 
 
+@concrete_only()
 def animate(
     mechanism: Mechanism | ConstrainedSystem | Mapping[str, Mechanism],
     solution: ShownMotion | Mapping[str, ShownMotion] | None = None,
@@ -292,6 +294,7 @@ def _live_runs(
 
 
 @checked
+@concrete_only()
 def animate_modes(
     mechanism: Mechanism,
     q: Annotated[Numbers, COORDINATES_OF_BODIES],

@@ -13,7 +13,7 @@ from udkjax.integrate.portable.c.scene import INFO, SceneCode, comment_text, str
 from udkjax.integrate.solution import Result, versions
 from udkjax.native.c import CUnit
 from udkjax.native.runs import RunStates
-from udkjax.requirements import ArgumentError
+from udkjax.requirements import ArgumentError, concrete_only
 from udkjax.scene.arguments import checked
 from udkjax.scene.elements.bodies import GROUND
 from udkjax.scene.mechanism import Mechanism
@@ -89,6 +89,7 @@ class ExportedCode(NamedTuple):
 
 
 @checked
+@concrete_only()
 def export_c(
     mechanism: Mechanism,
     folder: Path | str,
