@@ -102,7 +102,7 @@ def _with_multipliers(mechanism: Mechanism, multipliers: Float[Array, "m"]) -> d
 def loads_of_friction(
     mechanism: Mechanism, t: NumberLike, q: BodyArray, v: BodyArray, multipliers: Float[Array, "m"]
 ) -> dict[str, Float[Array, "n"]]:
-    """Return the loads of each friction, constant torques included, by its own name; see `rubbing_loads`."""
+    """Return the loads (n,) of each `Friction`, constant torques included, by the element's name; see `rubbing_loads`."""
     time, places = jnp.asarray(t, jnp.result_type(float)), frames(mechanism, q, v)
     by_joint, found = single_rubbing_loads(mechanism, t, q, v, multipliers), {}
     for name, force in mechanism.forces.items():

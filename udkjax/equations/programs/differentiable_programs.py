@@ -127,7 +127,7 @@ class DifferentiablePrograms:
             yield from friction.add_loads(0)
 
     def _implicit(self, target: str) -> DifferentiableProgram:
-        """Return the program of one of the outputs `IMPLICIT`."""
+        """Return the program that computes `target`, a key of `IMPLICIT`."""
         solver, terms, (right, x, sign) = self._solver, self._solver.terms, IMPLICIT[target]
         loads = [*terms.free_accelerations("v")] if target == "a" else []
         z, result = terms.add("z", solution=0), terms.add(target, start=x, change="z", sign=sign)

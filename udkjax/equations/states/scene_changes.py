@@ -138,7 +138,7 @@ class SceneChanges(eqx.Module):
 
     @property
     def is_unknown(self) -> Bool[Array, "T"]:
-        """A mask of the output times at which constraints hold that are not known."""
+        """A mask of the output times at which an added joint or a contact holds whose numbers are not known."""
         return jnp.any(self.holds[:, self.of_scene :], axis=1) & (not self.is_known)
 
 

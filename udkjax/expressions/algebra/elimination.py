@@ -130,7 +130,7 @@ class SymbolicFactors:
             self._rows[i] = {k: x for k, x in row.items() if not x.is_zero}
 
     def _rotate(self, a: list[list[Scalar]]) -> list[list[Scalar]]:
-        """Return B after rotations of pairs of its rows (`self._rotations`) that make it upper triangular: R."""
+        """Triangularize B = `a` in place by rotations of pairs of its rows, note these in `self._rotations`, and return R."""
         graph = self._graph
         for k in range(len(self.open_columns)):
             for j in range(k + 1, len(a)):

@@ -197,7 +197,9 @@ class ClosingReverse(ClosingDerivative):
             self._write_pull(x)
 
     def _write_pull(self, x: str):
-        """Write `pull_<x>(work, scale, limited)`: pull `bar iterate` back through a correction at the state.
+        """Write `pull_<x>(work, scale, limited)`, which pulls the cotangent of q or v back through a correction at the state.
+
+        The cotangent is the array `bar iterate q` or `bar iterate v`.
 
         The arguments are those of `_record_correction`.
         """

@@ -201,7 +201,10 @@ def _target(function: HostFunction) -> _Target:
 
 
 def _name(function: HostFunction) -> str:
-    """Return a new name for a function, by its description: JAX finds stored programs by their text, which contains the name."""
+    """Return a name for a function that is unique in this process, and the same in the next one.
+
+    It is a digest of the function's description, and a counter: JAX finds stored programs by their text, which contains the name.
+    """
     text = f"{type(function).__name__} {getattr(function, 'description', '')} {function.shapes(1)}"
     digest = hashlib.sha256(re.sub("0x[0-9a-f]+", "", text).encode()).hexdigest()[:32]  # without addresses of this process
     with _LOCK:

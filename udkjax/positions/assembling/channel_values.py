@@ -153,7 +153,7 @@ class _Motion:
 
     @cached_property
     def dynamics(self) -> _Dynamics:
-        """The solution of the equations of motion, computed only if a channel needs it."""
+        """Psi_q, the multipliers and the accelerations at all output times, computed only if a channel needs them."""
         assert self.scene is not None  # a channel that needs it asks for it
         mechanism, analysis, knowledge = self.scene[:3]
         equations: Any = equations_of(mechanism, SVD(), analysis=analysis)

@@ -239,7 +239,10 @@ class _Writer:
             self.problems.append(f"joint {quote(name)}: MJCF has no equality for a {type(joint).__name__.lower()}{closes}")
 
     def _add_coupling(self, name: str, joint: Screw | Coupling) -> None:
-        """Add an equality of two joints of the tree, each relative to its position in the file."""
+        """Add an equality: the coordinate of one joint of the tree is a polynomial of another's, from their initial positions.
+
+        If the format cannot express the coupling, a problem is noted.
+        """
         if isinstance(joint, Screw):
             sides = (joint.bodies, joint.axis, joint.points), (joint.turning, None, None)
             polynomial = np.polynomial.Polynomial([float(joint.constant), float(joint.lead) / (2 * np.pi)])

@@ -77,7 +77,10 @@ class System(Protocol):
         ...
 
     def sides(self, members: MemberIndices, joints: Any) -> Float[Any, "b S"]:
-        """Return all sides of members, of joints that may stick and of comparisons in forces (kinks.py), from `joints`."""
+        """Return the sides of each member, which `joints`, as in a `RunState`, ends with.
+
+        Those of joints that may stick come first, then those of comparisons in forces (kinks.py).
+        """
         ...
 
     def with_sides(self, members: MemberIndices, joints: Any, sides: Float[Any, "b S"]) -> Any:

@@ -200,6 +200,7 @@ class EventPlan:
 
     @cached_property
     def _pairs_of_locks(self) -> Bool[np.ndarray, "F C"]:
+        """A mask: True where switch c is the lock of joint f."""
         return self.locks[:, None] == np.arange(len(self.first))
 
     def not_sliding(self, sides: Float[Any, "*m S"], xp: ModuleType) -> Bool[Any, "*m E"]:

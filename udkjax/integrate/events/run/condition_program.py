@@ -113,8 +113,8 @@ def with_forces(conditions: Conditions, events: Sequence[Event], switches: Switc
 class _Functions:
     """The conditions of events that are plain functions, None for other conditions; a key of a cache.
 
-    Two lists are equal if their functions compute the same, also in future: they have equal programs and code, and refer to equal
-    numbers and strings, or to identical objects.
+    Two lists are equal if their functions compute the same values, now and in later calls: they have equal programs and code, and
+    refer to equal numbers and strings, or to identical objects.
     """
 
     def __init__(self, events: Sequence[Event], programs: Conditions):

@@ -100,7 +100,7 @@ def export_c(
     atol: Annotated[float, NOT_NEGATIVE] = 1e-8,
     stiff: bool = True,
 ) -> ExportedCode:
-    """Write a scene as C99 that depends on nothing but the library of C, and allocates no memory.
+    """Write a scene as C99 code that depends only on the C standard library, and allocates no memory.
 
     The C is a translation of the machine code that `simulate` runs, for one lane: it takes the same steps, and falls back to
     rank-revealing methods in the same singular configurations. `cc -O2 -std=c99 *.c -lm` compiles the folder. The program runs
@@ -111,21 +111,21 @@ def export_c(
     Args:
         mechanism: the scene, with concrete numbers. Its thresholds of rank follow from these numbers.
         folder: the folder to write, which is made if it does not exist.
-        what: functions to write: "run", a step with projection and whole runs; "accelerations"; their "derivatives" along a
-            direction; "step_derivatives", of a step; "projection" of a state; "positions", closed from a guess, as for a driven
-            mechanism; "position_derivatives"; and "reactions", loads of joints and efforts of drivers.
+        what: the functions to write: "run" (whole runs, and a single step with projection); "accelerations"; "derivatives" (of
+            accelerations, along a direction); "step_derivatives"; "projection" (of a state); "positions" (closed from a guess, as
+            for a driven mechanism); "position_derivatives"; "reactions" (loads of joints and efforts of drivers).
         ts: output times of the program (s); by default 0 to 20 s in steps of 0.05 s.
-        parameters: names of numbers that a function of the C changes, as in `with_parameters`.
+        parameters: names of the numbers that the C code can set, as in `with_parameters`.
         rtol: relative tolerance of a step.
         atol: absolute tolerance of a step, in units of the scene's characteristic length and time.
-        stiff: whether a run goes on by an implicit method where it is stiff; without, it needs less memory.
+        stiff: whether a run switches to an implicit method where it is stiff; without this it needs less memory.
 
     Returns:
-        The files, with the memory and the operations that functions need.
+        The files written, with the memory and the number of operations that each function needs.
 
     Raises:
-        ArgumentError: the scene has joints that stick, forces with kinks, or equations without machine code; or the folder has
-            a file of other origin that would be replaced.
+        ArgumentError: the scene has joints that stick, forces with kinks, or equations without machine code; or a file
+            that udkjax did not write would be replaced.
         AssemblyError: the initial guess cannot be closed.
     """
     mechanism.require_masses("exported accelerations")

@@ -295,7 +295,11 @@ def _noise_sentence(chi2: float, freedom: int) -> Iterator[str]:
 
 
 def describe(values: UnknownValues, coefficients: Float[np.ndarray, "K"]) -> Direction:
-    """Return a direction of z in words: by a common factor, or by changes that are scaled so that the largest is one percent."""
+    """Return the direction in z with these coefficients.
+
+    Its text says that the parameters change by a common factor, or how much each of them changes if the largest change is one
+    percent.
+    """
     nonzero = np.flatnonzero(coefficients).tolist()
     x, change = (np.asarray(a, float)[nonzero] for a in (values.x, values.dx_dz))
     change = change * coefficients[nonzero]

@@ -219,7 +219,7 @@ class _DataReader:
         self.problems: list[str] = []
 
     def read(self, data: Data, source: str) -> Iterator[Record]:
-        """Iterate over the records in any kind of data."""
+        """Yield the records in any kind of data, nested lists included; `source` names the data in messages."""
         if isinstance(data, Record):
             yield data
         elif isinstance(data, list | tuple):
