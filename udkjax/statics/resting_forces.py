@@ -67,7 +67,7 @@ def forces_table(mechanism: Mechanism, q: ArrayLike) -> PrintedTable | None:
 
 
 def _effort(mechanism: Mechanism, name: str, effort: Any, scale: float) -> str:
-    """Return the effort of a driver as text with its unit; it is 0 if it is a rounding error of forces of the size `scale` (N)."""
+    """Return the effort of a driver as text with its unit; 0 if it is a rounding error of forces of the size `scale` (N)."""
     unit = mechanism.drivers[name].effort_unit
     return format_number(effort, unit, scale if unit == "N" else scale * float(analyse(mechanism).length))
 
