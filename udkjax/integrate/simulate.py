@@ -283,9 +283,12 @@ def _has_failed(code: Any) -> bool:
 
 
 def _required(solution: Solution, throw: bool) -> Solution:
-    """Return a solution; if it is that of a failed run and `throw` is set, raise `SimulationError`."""
-    if throw and _has_failed(solution.code):
-        raise SimulationError(solution.cause, solution)
+    """Return a solution; if it is that of a failed run and `throw` is set, raise `SimulationError`.
+
+    The error carries the solution without derivatives. In a program, where numbers are traced, nothing is raised.
+    """
+    if throw and _has_failed(solution.code) and not is_traced(found := without_derivatives(solution)):
+        raise SimulationError(found.cause, found)
     return solution
 
 

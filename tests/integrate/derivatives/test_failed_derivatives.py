@@ -48,6 +48,7 @@ def undefined(p):
 
 
 EVENT = udk.Event(lambda t, at: at["crank"].angle - 100.0, udk.Log())
+EVENTS = [udk.Event(lambda t, at, after=after: t - after, udk.Log()) for after in (0.1, 0.2)]
 FUNCTIONS = {
     "simulate, loop": lambda p: states(udk.simulate(long(p), TS)),
     "simulate, state open": lambda p: states(udk.simulate(heavy(p), TS, udk.State(STATE.q + 0.3, STATE.v))),
@@ -125,9 +126,10 @@ def test_outputs_before_a_failure_keep_their_derivatives():
     np.testing.assert_allclose(slopes(TS, max_steps=most), slopes(TS[:2]), rtol=1e-6)
 
 
-def test_eager_derivatives_of_a_run_that_fails_raise_its_error():
+@pytest.mark.parametrize("settings", [{"max_steps": 4}, {"max_events": 1, "events": EVENTS}], ids=["steps", "events"])
+def test_eager_derivatives_of_a_run_that_fails_raise_its_error(settings):
     """With the same message as the run itself."""
-    run = lambda p: udk.simulate(heavy(p), TS, max_steps=4).q[-1, 0, 2]  # noqa: E731
+    run = lambda p: udk.simulate(heavy(p), TS, **settings).q[-1, 0, 2]  # noqa: E731
     messages = []
     for call in (run, jax.grad(run), jax.jacfwd(run)):
         with pytest.raises(udk.SimulationError) as error:
