@@ -86,17 +86,20 @@ def step(
             cure = "make a ConstrainedSystem of functions that hold the inputs of the interval"
             mechanism.require_bodies(f"inputs are for mechanisms: {cure}")
         moved = mechanism.traced(np.size(state.q))
-    if may_stick(mechanism):
-        return _step_with_events(mechanism, state, _checked_inputs(inputs), dt, t, rtol, atol, max_steps, analysis, engine)
     values, others = _checked_inputs(inputs), {"dt": dt, "t": t, "rtol": rtol, "atol": atol}
     if not is_concrete(moved, analysis) or is_traced((state.q, state.v, values, others)):
+        if may_stick(moved):
+            return _step_with_events(mechanism, state, values, dt, t, rtol, atol, max_steps, analysis, engine)
         analysis, has_fixed_times = analysis or analysis_of(moved), not is_traced((t, dt))
         if is_within_jit():
             return _advance(moved, analysis, state, values, others, max_steps, engine, has_fixed_times)
         values, others = ({name: number(x) for name, x in given.items()} for given in (values, others))
         moved = moved.without_origin_beside(tuple(values))
         return _advance_at_once(moved, analysis, state, values, others, max_steps, engine, has_fixed_times)
-    run = _steps_of(moved, analysis, *values).program(moved, values, np.shape(state.q), max_steps, engine)
+    steps = _steps_of(moved, analysis, *values)
+    if steps.sticks:
+        return _step_with_events(mechanism, state, values, dt, t, rtol, atol, max_steps, analysis, engine)
+    run = steps.program(moved, values, np.shape(state.q), max_steps, engine)
     q, v = run(state, values, others)
     if not np.isfinite(np.asarray(q)).all():  # raises, with the cause
         given = moved if values else mechanism
@@ -171,6 +174,7 @@ class _Steps:
     """
 
     def __init__(self, mechanism: Any, analysis: Analysis | None):
+        self.sticks = may_stick(mechanism)
         leaves, self._form = jax.tree.flatten((mechanism, analysis))
         leaves = [np.asarray(x) for x in leaves]
         self._kinds = tuple((x.shape, x.dtype) for x in leaves)
