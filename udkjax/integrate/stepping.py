@@ -89,7 +89,7 @@ def step(
     values, others = _checked_inputs(inputs), {"dt": dt, "t": t, "rtol": rtol, "atol": atol}
     if not is_concrete(moved, analysis) or is_traced((state.q, state.v, values, others)):
         if may_stick(moved):
-            return _step_with_events(mechanism, state, values, dt, t, rtol, atol, max_steps, analysis, engine)
+            return _step_by_run(mechanism, state, values, dt, t, rtol, atol, max_steps, analysis, engine)
         analysis, has_fixed_times = analysis or analysis_of(moved), not is_traced((t, dt))
         if is_within_jit():
             return _advance(moved, analysis, state, values, others, max_steps, engine, has_fixed_times)
@@ -97,17 +97,15 @@ def step(
         moved = moved.without_origin_beside(tuple(values))
         return _advance_at_once(moved, analysis, state, values, others, max_steps, engine, has_fixed_times)
     steps = _steps_of(moved, analysis, *values)
-    if steps.sticks:
-        return _step_with_events(mechanism, state, values, dt, t, rtol, atol, max_steps, analysis, engine)
-    run = steps.program(moved, values, np.shape(state.q), max_steps, engine)
-    q, v = run(state, values, others)
-    if not np.isfinite(np.asarray(q)).all():  # raises, with the cause
-        given = moved if values else mechanism
-        return _step_with_events(given, state, values, dt, t, rtol, atol, max_steps, analysis=None, engine=engine)
-    return make_module(State, q=q, v=v)
+    if not steps.sticks:
+        q, v = steps.program(moved, values, np.shape(state.q), max_steps, engine)(state, values, others)
+        if np.isfinite(np.asarray(q)).all():
+            return make_module(State, q=q, v=v)
+    # If the end was not reached, this run raises the error, with the cause.
+    return _step_by_run(mechanism, state, values, dt, t, rtol, atol, max_steps, analysis, engine)
 
 
-def _step_with_events(
+def _step_by_run(
     mechanism: Any,
     state: State,
     values: Mapping[str, Numbers],
@@ -119,7 +117,7 @@ def _step_with_events(
     analysis: Analysis | None,
     engine: Literal["auto", "native", "diffrax", "jax"],
 ) -> State:
-    """Return the state after an interval as a run by `simulate`, which locates where joints stick and slip."""
+    """Return the state after an interval by `simulate`, which locates where joints stick and slip, and explains failures."""
     given = mechanism.with_parameters(values) if values else mechanism
     xp = jnp if is_traced((t, dt)) else np
     start, length = xp.asarray(t, float), xp.asarray(dt, float)

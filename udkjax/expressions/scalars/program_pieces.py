@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from udkjax.expressions.scalars.scalar_program import ScalarProgram
 
-LONGEST = 4_000  # operations of a piece; pieces of 2,000 run a tenth longer, and LLVM compiles one of 26,000 ten times as long
+LONGEST = 4_000  # operations of a piece; with 2,000, runs take a tenth longer; with 26,000, LLVM takes ten times as long
 
 
 class ProgramPiece(NamedTuple):
