@@ -1,7 +1,7 @@
 """Requirements on arguments (real, finite, shape, sign), with errors that state the argument and its value."""
 
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import nullcontext
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
 from functools import wraps
 from inspect import isclass, signature
 from types import MappingProxyType
@@ -151,6 +151,17 @@ def require_function(name: str, value: Any, arguments: str) -> None:
         own.bind(*arguments.split(","))
     except TypeError:
         raise ArgumentTypeError(f"{name} must be a function {arguments}, not of {own}") from None
+
+
+@contextmanager
+def tracing(where: str) -> Iterator[None]:
+    """Note the name and the cure on JAX's error about a traced number, if the user's function `where` raises one within."""
+    try:
+        yield
+    except (jax.errors.JAXTypeError, jax.errors.JAXIndexError) as error:
+        cure = "write it with jax.numpy instead of NumPy, math, int() and float(), and with jax.numpy.where instead of `if`"
+        error.add_note(f"{where} is traced by JAX: {cure}")
+        raise
 
 
 def require_count(name: str, value: Any, least: float = 1, given: GivenArguments = NOTHING) -> None:

@@ -16,7 +16,7 @@ from jaxtyping import Array
 
 from udkjax.annotations import NumberLike, Numbers
 from udkjax.argument_types import COUNT, NOT_NEGATIVE, OUTPUT_TIMES, POSITIVE, POSITIVE_OR_INFINITE
-from udkjax.arrays import is_traced, is_within_jit, make_module, number, put_arrays, without_derivatives
+from udkjax.arrays import float_type, is_traced, is_within_jit, make_module, number, put_arrays, without_derivatives
 from udkjax.devices import on_host
 from udkjax.equations.laws.formulations import Formulation
 from udkjax.equations.laws.udwadia_kalaba import Baumgarte
@@ -44,7 +44,7 @@ from udkjax.integrate.prepare import (
 )
 from udkjax.integrate.problem import IntegratorOutput
 from udkjax.integrate.projection import Projection
-from udkjax.integrate.solution import SUCCESSES, SimulationError, Solution
+from udkjax.integrate.solution import SUCCESSES, Result, SimulationError, Solution
 from udkjax.integrate.solvers.diffrax_arguments import ADJOINT, CONTROLLER, SOLVER
 from udkjax.integrate.stabilization import Stabilization
 from udkjax.pinv import Pseudoinverse
@@ -221,7 +221,12 @@ class _Run(NamedTuple):
     sticks: bool  # whether friction may hold a joint
 
     def explained(self, solution: Solution, end: Any) -> Solution:
-        """Return a failed solution with its cause, found from `end`, the last time and state (t, y) of the integrator."""
+        """Return a failed solution with its cause, found from `end`, the last time and state (t, y) of the integrator.
+
+        A system that could not be closed is explained by its initial guess.
+        """
+        if self.analysis is None and self.state is None and int(solution.code) == Result.could_not_assemble:
+            end = self.ts[0], np.concatenate([self.mechanism.q0, self.mechanism.v0])
         return explained(solution, self.system, self.analysis, self.choices.drift_tol, self.choices.solver, end)
 
 
@@ -229,8 +234,10 @@ def _with_events(run: _Run, events: Any, max_events: int | None) -> Solution:
     """Return the solution of a run that locates events, kinks of forces, and the sticking of joints."""
     if without := run.choices.without_events:
         raise ValueError(f"a run with events needs JAX's own derivatives, its own steps and no progress meter: not {without}")
-    if not run.system.has_programs:
-        raise ValueError("events of a ConstrainedSystem need float64, which is off in JAX: leave JAX_ENABLE_X64 unset")
+    # The times of events are located to 1e-9 T, far below the rounding of a time in float32.
+    is_located = events is not None or run.sticks or not run.system.has_programs
+    if is_located and float_type() != np.float64:
+        raise ValueError("events and joints that stick need float64, which is off in JAX: leave JAX_ENABLE_X64 unset")
     from udkjax.integrate.events.simulate_events import simulate_events  # imports a dozen modules that other runs do not need
 
     most = (MAX_EVENTS_STICKING if run.sticks else MAX_EVENTS) if max_events is None else max_events

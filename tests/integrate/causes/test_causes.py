@@ -13,7 +13,7 @@ import pytest
 import udkjax as udk
 from tests.choices import fast
 from udkjax import Result
-from udkjax.integrate.causes.system_causes import cause_of
+from udkjax.equations.systems.function_causes import cause_of
 
 CRANK, COUPLER, ROCKER, GROUND = 1.0, 1.5, 1.2, 2.2  # not Grashof's: the crank has limits
 START = np.pi / 3

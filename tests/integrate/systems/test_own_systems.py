@@ -431,3 +431,35 @@ def test_a_long_chain_in_space_swings_in_its_plane_as_a_planar_one():
 def test_functions_that_do_not_fit_are_named(functions, message):
     with pytest.raises((TypeError, ValueError), match=message):
         udk.ConstrainedSystem(**{"mass": lambda q: jnp.eye(2)} | functions)
+
+
+@pytest.mark.parametrize(
+    ("functions", "message"),
+    [
+        ({"mass": lambda q: -jnp.eye(2)}, "the mass matrix is not positive definite: its eigenvalues are -1 to -1"),
+        (
+            {"mass": lambda q: jnp.diag(jnp.array([1.0, 0.0]))},
+            "mass matrix is not positive definite: its eigenvalues are 0 to 1",
+        ),
+        ({"constraint": lambda t, q: {"rod": jnp.log(-q[0])}}, "constraint of the system is not finite"),
+        ({"mass": lambda q: None}, r"mass must return the shape \(2, 2\) for 2 coordinates, not None"),
+        ({"constraint": lambda t, q: {"rod": None}}, "constraint must return a vector for 2 coordinates, not None"),
+        ({"potential": lambda t, q: "y"}, 'potential must return a number for 2 coordinates, not "y"'),
+    ],
+)
+@pytest.mark.parametrize("function", [udk.assemble, lambda system: udk.simulate(system, TS)])
+def test_functions_whose_values_do_not_fit_are_named(functions, message, function):
+    circle = {"constraint": lambda t, q: {"rod": q @ q - 1.0}, "potential": lambda t, q: q[1]}
+    system = udk.ConstrainedSystem(**{"mass": lambda q: jnp.eye(2)} | circle | functions, q0=[1.0, 0.0])
+    with pytest.raises((TypeError, ValueError, RuntimeError), match=message):
+        function(system)
+
+
+@pytest.mark.parametrize(
+    "force", [lambda t, q, v: -np.sin(q), lambda t, q, v: -q if q[0] > 0 else q, lambda t, q, v: [float(q[0])]]
+)
+def test_a_function_that_jax_cannot_trace_is_named(force):
+    system = udk.ConstrainedSystem(lambda q: jnp.eye(1), force, q0=[1.0])
+    with pytest.raises(TypeError) as raised:
+        udk.simulate(system, TS)
+    assert "force of a ConstrainedSystem is traced by JAX: write it with jax.numpy" in raised.value.__notes__[0]

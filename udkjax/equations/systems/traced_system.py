@@ -27,7 +27,7 @@ from udkjax.equations.terms.elements import choose_shorter, gamma_by_entries
 from udkjax.expressions import Differential, Graph, Scalar, may_have_kinks, trace
 from udkjax.expressions.algebra.differential import SparseRow
 from udkjax.programs.identity_cache import cached_by_identity, is_concrete
-from udkjax.requirements import ArgumentError
+from udkjax.requirements import ArgumentError, describe, tracing
 from udkjax.scene.model import RunModel
 
 FUNCTIONS = {
@@ -276,9 +276,10 @@ def trace_system(system: Any, n: int) -> TracedSystem:
 
         def function(*arrays: Any, name: str = name) -> Array:
             own: Any = eqx.combine(jax.tree.unflatten(tree, arrays[: len(listed)]), others)
-            value = own[name](*arrays[len(listed) :])
+            with tracing(f"{name} of a ConstrainedSystem"):
+                value = own[name](*arrays[len(listed) :])
             labels[name] = labels_of_rows(name, value)
-            return _checked(name, jnp.asarray(joined_rows(value), float), n)
+            return _checked(name, value, n)
 
         closed = jax.make_jaxpr(function)(*listed, *(examples[x] for x in FUNCTIONS[name]))
         is_number = [isinstance(x, Tracer) or eqx.is_inexact_array_like(x) for x in closed.consts]
@@ -304,12 +305,19 @@ def labels_of_rows(name: str, value: Any) -> list[str]:
     return [str(label) if count == 1 else f"{label}[{k}]" for label, count in parts for k in range(count)]
 
 
-def _checked(name: str, value: Array, n: int) -> Array:
-    """Return the value of the function `name`, with a single row as a vector; raise `ArgumentError` for a wrong shape."""
-    if name in ("constraint", "velocity_constraint"):
-        value = jnp.atleast_1d(value)
+def _checked(name: str, value: Any, n: int) -> Array:
+    """Return the value of the function `name` as an array, with a single row as a vector.
+
+    Raises `ArgumentError` if it is anything else than numbers, or has another shape than a system of n coordinates needs.
+    """
     wanted = {"mass": (n, n), "force": (n,), "potential": ()}.get(name)
-    if (wanted is not None and value.shape != wanted) or (wanted is None and value.ndim > 1):
-        shape = "a vector" if wanted is None else f"the shape {wanted}" if wanted else "a number"
-        raise ArgumentError(f"{name} must return {shape} for {n} coordinates, not an array of shape {value.shape}")
-    return value
+    shape = "a vector" if wanted is None else f"the shape {wanted}" if wanted else "a number"
+    try:
+        numbers = jnp.asarray(joined_rows(value), float)
+    except (TypeError, ValueError):
+        found = describe(next((x for x in value.values() if x is None), value) if isinstance(value, Mapping) else value)
+        raise ArgumentError(f"{name} must return {shape} for {n} coordinates, {found}") from None
+    numbers = jnp.atleast_1d(numbers) if wanted is None else numbers
+    if (wanted is not None and numbers.shape != wanted) or (wanted is None and numbers.ndim > 1):
+        raise ArgumentError(f"{name} must return {shape} for {n} coordinates, not an array of shape {numbers.shape}")
+    return numbers

@@ -64,6 +64,12 @@ def test_mistakes_are_named(events, message):
         udk.simulate(PENDULUM, TS, events=events)
 
 
+def test_a_condition_that_jax_cannot_trace_is_named():
+    with pytest.raises(TypeError) as raised:
+        udk.simulate(PENDULUM, TS, events=udk.Event(lambda t, at: int(at["link"].x), name="grid"))
+    assert 'the condition of the event "grid" is traced by JAX: write it with jax.numpy' in raised.value.__notes__[0]
+
+
 def test_events_by_name_are_those_of_a_list_with_names():
     """The same object under a name compiles nothing anew."""
     limit, log = udk.JointLimit("A", lower=-0.5), udk.Event(lambda t, at: at["link"].angle, udk.Log())

@@ -21,6 +21,8 @@ from udkjax.integrate.events.law.sticking_joints import forces_of
 from udkjax.native.language.program import UnsupportedError, vector_function
 from udkjax.native.watching.conditions import Conditions
 from udkjax.programs.identity_cache import cached_by_identity, cached_by_size, is_concrete
+from udkjax.requirements import tracing
+from udkjax.wording import quote
 
 
 def condition_numbers(events: Sequence[Event]) -> list[Array]:
@@ -194,4 +196,8 @@ def _text(program: ScalarProgram) -> str:
 def conditions_of(events: Sequence[Event], names: tuple[str, ...], t: Array, q: Any, v: Any) -> Float[Array, "E"]:
     """Return the values of the conditions of all events at a state; `names` are those of the bodies, () for a system."""
     arguments = (frames_of(names, q, v),) if names else (q, v)
-    return jnp.stack([jnp.asarray(e.condition(t, *arguments), float) for e in events])
+    found = []
+    for event in events:
+        with tracing(f"the condition of the event {quote(event.name)}"):
+            found.append(jnp.asarray(event.condition(t, *arguments), float))
+    return jnp.stack(found)
