@@ -225,9 +225,10 @@ class _Run(NamedTuple):
 
         A system that could not be closed is explained by its initial guess.
         """
-        if self.analysis is None and self.state is None and int(solution.code) == Result.could_not_assemble:
-            end = self.ts[0], np.concatenate([self.mechanism.q0, self.mechanism.v0])
-        return explained(solution, self.system, self.analysis, self.choices.drift_tol, self.choices.solver, end)
+        guess = getattr(self.mechanism, "q0", None), getattr(self.mechanism, "v0", None)
+        if self.analysis is None and guess[0] is not None and int(solution.code) == Result.could_not_assemble:
+            end = self.ts[0], np.concatenate(guess)
+        return explained(solution, self.mechanism, self.analysis, self.choices.drift_tol, self.choices.solver, end)
 
 
 def _with_events(run: _Run, events: Any, max_events: int | None) -> Solution:

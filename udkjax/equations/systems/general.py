@@ -11,12 +11,13 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 from typing_extensions import TypeAliasType
 
-from udkjax.annotations import Numbers, NumericArray, Time, Vector
+from udkjax.annotations import NumberLike, Numbers, NumericArray, Time, Vector
 from udkjax.arrays import is_traced, number, number_called
 from udkjax.equations.laws.abstract_system import ConstrainedRows, TangentPart
 from udkjax.equations.laws.udwadia_kalaba import Baumgarte
 from udkjax.equations.programs.run_programs import RunPrograms
 from udkjax.equations.programs.scales import Scales, UnitScales
+from udkjax.equations.systems.function_causes import cause_at
 from udkjax.equations.systems.system_numbers import number_fields, with_numbers
 from udkjax.equations.systems.system_programs import system_programs
 from udkjax.equations.systems.traced_system import TracedSystem, joined_rows, load, trace_system
@@ -129,6 +130,10 @@ class ConstrainedSystem(PrintsLine, Model):
 
     def with_guess(self, q: NumericArray, v: NumericArray) -> "ConstrainedSystem":
         return self.with_parameters({"q0": q, "v0": v})
+
+    def cause_at(self, t: NumberLike, q: NumericArray, v: NumericArray) -> str:
+        """Return why the system can neither be closed nor integrated at a state: what its functions show, or ""."""
+        return cause_at(self.traced(np.size(q)), t, q, v)
 
     def traced(self, n: int) -> Any:
         """Return the `TracedSystem` from which programs are made, for n coordinates; without float64 the system itself.

@@ -256,7 +256,7 @@ def explained(
 
     Args:
         solution: the solution, of concrete numbers.
-        mechanism: the mechanism, or the traced system.
+        mechanism: the mechanism, or the system.
         analysis: the `Analysis` of the mechanism; None for a system.
         drift_tol: the `drift_tol` of the run.
         solver: the run's solver; None: the default.

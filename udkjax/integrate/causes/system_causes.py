@@ -1,32 +1,33 @@
 """The causes of failed runs of user-defined systems: a singular mass matrix, a function that is not finite, or an open state."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Array
 
-from udkjax.equations.systems.function_causes import cause_at
+from udkjax.equations.systems.general import ConstrainedSystem
 from udkjax.integrate.solution import Result, Solution
 from udkjax.programs.deferred import deferred
 
 MOST_ROWS = 3  # rows of constraints that a cause names, those with the largest violations
 
 
-def cause_in_functions(solution: Solution, system: Any, end: tuple[Any, Any]) -> str:
+def cause_in_functions(solution: Solution, system: ConstrainedSystem, end: tuple[Any, Any]) -> str:
     """Return the cause of a failed run that the functions of a system show at `end`, the last (t, y); "" if they show none."""
-    text = cause_at(system, end[0], *np.split(np.asarray(end[1]), 2))
+    q, v = np.split(np.asarray(end[1]), 2)
+    text, is_open = system.cause_at(end[0], q, v), int(np.asarray(solution.code)) == Result.initial_state_open
+    if text or not is_open or system.constraint is None:
+        return text
     with jax.ensure_compile_time_eval():
-        is_open = int(np.asarray(solution.code)) == Result.initial_state_open
-        if not text and is_open and system.constraint is not None:
-            psi = _psi(system, np.asarray(solution.ts[0]), np.asarray(solution.q[0]))
-            text = cause_of_opening(np.ravel(psi))
-    return text
+        psi = _psi(system.traced(q.size), np.asarray(solution.ts[0]), np.asarray(solution.q[0]))
+        return cause_of_opening(np.concatenate([np.ravel(x) for x in psi]))
 
 
 @deferred
-def _psi(system: Any, t: Any, q: Any) -> Array:
-    return system.constraint(t, q)
+def _psi(system: Any, t: Any, q: Any) -> list[Any]:
+    psi = system.constraint(t, q)
+    return [*psi.values()] if isinstance(psi, Mapping) else [psi]
 
 
 def cause_of_opening(psi: np.ndarray) -> str:

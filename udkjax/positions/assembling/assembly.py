@@ -38,7 +38,6 @@ from udkjax.equations.programs.scene_programs import scene_programs
 from udkjax.equations.rows.analysis import Analysis, analyse
 from udkjax.equations.rows.dense_rows import DenseRows
 from udkjax.equations.rows.position_closure import CLOSURE, is_closed
-from udkjax.equations.systems.function_causes import cause_at
 from udkjax.equations.systems.general import ConstrainedSystem
 from udkjax.equations.terms.element_programs import has_rheonomic_joints
 from udkjax.positions.assembling import native_closing
@@ -277,7 +276,7 @@ def require_closed(
         return
     if not isinstance(mechanism, Mechanism):
         start = (mechanism.q0, mechanism.v0) if guess is None else (guess.q, guess.v)
-        if cause := cause_at(mechanism.traced(np.size(start[0])), t, *start):
+        if cause := mechanism.cause_at(t, *start):
             raise AssemblyError(cause, closure.state)
         worst = [float(jnp.max(jnp.abs(x), initial=0.0)) for x in (closure.psi, closure.psi_dot)]
         message = f"the constraints stay violated, Psi by {worst[0]:.3g} and velocities by {worst[1]:.3g}"
