@@ -225,9 +225,9 @@ class _Run(NamedTuple):
 
         A system that could not be closed is explained by its initial guess.
         """
-        guess = getattr(self.mechanism, "q0", None), getattr(self.mechanism, "v0", None)
-        if self.analysis is None and guess[0] is not None and int(solution.code) == Result.could_not_assemble:
-            end = self.ts[0], np.concatenate(guess)
+        q, v = self.mechanism.q0, self.mechanism.v0
+        if self.analysis is None and q is not None and v is not None and int(solution.code) == Result.could_not_assemble:
+            end = self.ts[0], np.concatenate([q, v])
         return explained(solution, self.mechanism, self.analysis, self.choices.drift_tol, self.choices.solver, end)
 
 

@@ -275,8 +275,8 @@ def require_closed(
     if is_traced((mechanism, closure, t, guess)):  # other numbers of a batch
         return
     if not isinstance(mechanism, Mechanism):
-        start = (mechanism.q0, mechanism.v0) if guess is None else (guess.q, guess.v)
-        if cause := mechanism.cause_at(t, *start):
+        q, v = (mechanism.q0, mechanism.v0) if guess is None else (guess.q, guess.v)
+        if q is not None and v is not None and (cause := mechanism.cause_at(t, q, v)):
             raise AssemblyError(cause, closure.state)
         worst = [float(jnp.max(jnp.abs(x), initial=0.0)) for x in (closure.psi, closure.psi_dot)]
         message = f"the constraints stay violated, Psi by {worst[0]:.3g} and velocities by {worst[1]:.3g}"
