@@ -4,10 +4,12 @@
 # All of these runs have events.
 from dataclasses import replace
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import udkjax as udk
 from tests.integrate.events.event_scenes import BALL, CATCH, CAUGHT, PENDULUM, G
@@ -90,6 +92,37 @@ def test_an_action_of_ones_own_is_a_class():
     assert np.abs(after[2] + 0.15 / 0.35 * before[2]) < 1e-8
     tip = found.q[-1, 0, :2] + 0.5 * np.array([np.cos(found.q[-1, 0, 2]), np.sin(found.q[-1, 0, 2])])
     assert np.abs(tip - np.array([0.0, -1.0])).max() < 1e-9
+
+
+class Bumper(Action):
+    """An impact on a rubber pad: its restitution is that of the material, to the power 1 + thickness."""
+
+    material: jax.Array = eqx.field(converter=jnp.asarray)
+    thickness: jax.Array = eqx.field(converter=jnp.asarray)
+
+    is_impact = True
+    needs_joints = False
+
+    @property
+    def rebound(self):
+        return self.material ** (1 + self.thickness)
+
+
+@pytest.mark.parametrize("jacobian", [jax.jacfwd, jax.jacrev])
+def test_an_action_of_ones_own_has_numbers(jacobian):
+    """A ball dropped from 1 m meets the floor at t = (2/g)^(1/2), and leaves it with e times its speed; so do its derivatives."""
+
+    def height(numbers):
+        bumper = udk.Event(lambda t, at: at["ball"].y, Bumper(*numbers), name="bumper")
+        return udk.simulate(BALL, np.array([0.0, 0.6]), events=bumper, rtol=1e-11, atol=1e-11).q[-1, 0, 1]
+
+    def exact(numbers):
+        meets = np.sqrt(2 / G)
+        return numbers[0] ** (1 + numbers[1]) * G * meets * (0.6 - meets) - G * (0.6 - meets) ** 2 / 2
+
+    numbers = jnp.array([0.8, 0.5])
+    assert_allclose(height(numbers), exact(numbers), atol=1e-9)
+    assert_allclose(jacobian(height)(numbers), jax.jacfwd(exact)(numbers), atol=1e-8)
 
 
 @pytest.mark.slow
