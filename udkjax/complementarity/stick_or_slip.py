@@ -163,7 +163,7 @@ class JointsAtRest(NamedTuple):
     size: Float[Any, "*m F"]  # roots of the accelerations at unit forces: the units of W
     locked: Bool[Any, "*m F"]  # whether the joint was locked before
     rested: Bool[Any, "*m F"]  # whether the joint was at rest before, locked or kept at rest by others
-    unit: Float[Any, "*m F"]  # size of accelerations that are not zero
+    unit: Float[Any, "*m F"]  # characteristic accelerations: those smaller than `AT_REST.still` of them are zero
     contacts: ContactsAtRest
 
     @classmethod
@@ -189,7 +189,7 @@ class JointsAtRest(NamedTuple):
                 diagonal entry of W is negligible compared with this.
             locked: Mask of the joints that were locked before.
             rested: Mask of the joints that were at rest before.
-            unit: Size of accelerations that are not zero.
+            unit: Characteristic accelerations of the joints: those smaller than `AT_REST.still` of them are zero.
             xp: jax.numpy, or NumPy.
             contacts: The contacts; None: there are none.
         """

@@ -1,8 +1,6 @@
 """JAX functions of one member as machine code: each primitive, loops and branches equal JAX in every lane."""
 
-import ctypes
 import itertools
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,49 +11,19 @@ from jax.extend import core
 from jax.scipy.linalg import cho_factor, cho_solve
 from numpy.testing import assert_allclose
 
-from udkjax.native.code import machine, processor
+from tests.native.lowering.lowered import lowered, write
+from udkjax.native.code import processor
 from udkjax.native.language.program import UnsupportedError
 from udkjax.native.language.text import text_of_module
-from udkjax.native.lowering.arrays import Stored, base_of
-from udkjax.native.lowering.lowering import APART, LoweredFunction, Lowering, traced
+from udkjax.native.lowering.lowering import APART, traced
 from udkjax.native.lowering.module_calls import call_p
 from udkjax.native.lowering.own_objects import Written
-from udkjax.native.lowering.rules import CONTROL, ELEMENTWISE, RULES, lower
+from udkjax.native.lowering.rules import CONTROL, ELEMENTWISE, RULES
 from udkjax.native.lowering.varying import inlined
 
 A, B = (np.random.default_rng(k).standard_normal((9, 4, 5)) for k in (0, 1))
 P = np.abs(A) / 4  # within the domain of all functions
 INDEX = np.arange(9) % 7 - 1  # an index for each member, some outside
-
-
-def write(function, given, width):
-    """Write `lowered(inputs..., outputs..., scratch)`; return it, and the shapes and types of the outputs."""
-    closed = jax.make_jaxpr(function)(*(jax.ShapeDtypeStruct(x.shape[1:], x.dtype) for x in given))
-    outs: list[Any] = [v.aval for v in closed.jaxpr.outvars]
-    names = [*(f"in{k}" for k in range(len(given))), *(f"out{k}" for k in range(len(outs)))]
-    f = LoweredFunction("lowered", [*names, "scratch"], width)
-    to = Lowering(f, f.given["scratch"], lower)
-    arrays = [Stored(f.given[f"in{k}"], x.shape[1:], base_of(x.dtype), True) for k, x in enumerate(given)]
-    for k, x in enumerate(to.closed(closed, arrays)):
-        to.fill(Stored(f.given[f"out{k}"], x.shape, x.base, True), x)
-    return f, [(x.shape, np.float64 if x.dtype == np.float64 else np.int64) for x in outs], to.size
-
-
-def lowered(function, given, width):
-    """Return the outputs for all members; memory that was never written holds NaN."""
-    f, outs, size = write(function, given, width)
-    library = machine.library(text_of_module([f, *f.evaluated.values()]), ["lowered"])
-    call, found = machine.function(library["lowered"], *[ctypes.c_void_p] * (len(given) + len(outs) + 1)), []
-    count = len(given[0])
-    for k in range(0, count, width):
-        chosen = np.minimum(np.arange(k, k + width), count - 1)
-        kinds = [np.float64 if x.dtype == np.float64 else np.int64 for x in given]
-        ins = [np.ascontiguousarray(np.moveaxis(x[chosen].astype(t), 0, -1)) for x, t in zip(given, kinds, strict=True)]
-        results = [np.zeros((*shape, width), t) for shape, t in outs]
-        scratch = np.full(size * width + 8, np.nan)
-        call(*(x.ctypes.data for x in (*ins, *results, scratch)))
-        found.append([np.moveaxis(x, -1, 0) for x in results])
-    return [np.concatenate([x[j] for x in found])[:count] for j in range(len(outs))]
 
 
 def unary(*names):
