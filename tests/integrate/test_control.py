@@ -293,7 +293,7 @@ def test_an_input_that_is_no_constant_is_refused():
         udk.step(mechanism, udk.assemble(mechanism), {"force.motor.value": held}, 0.1)
 
 
-def rubbing(law="set-valued", **more) -> udk.Mechanism:
+def rubbing(law: Any = "set-valued", **more) -> udk.Mechanism:
     """A block of 1 kg on a rail along x, with a coefficient of friction of 0.3."""
     block, rail = {"block": udk.Body(1.0, 0.1, velocity=(1.0, 0.0))}, udk.Prismatic(("ground", "block"), np.zeros((2, 2)), 0.0)
     return udk.Mechanism(block, {"S": rail}, forces={"rub": udk.Friction("S", coefficient=0.3, law=law), **more})
