@@ -10,8 +10,8 @@ import numpy as np
 from udkjax.native import loaded_code, primitive, records
 from udkjax.native.code import machine, processor
 from udkjax.native.derivatives.record import FIRST_POINTS, Recorded
-from udkjax.native.gpu.kernel import VECTOR, KernelCode, kernel_code
-from udkjax.native.loaded_code import BREAKS
+from udkjax.native.gpu.kernel import VECTOR_LENGTH, KernelCode, kernel_code
+from udkjax.native.loaded_code import BREAKS_INPUT
 from udkjax.native.module.layout import INPUTS
 from udkjax.native.operations import Operation
 
@@ -43,19 +43,19 @@ def calls_of(function: Callable, *given: Any) -> list[Called]:
         calls.append(Called(operation, arrays, times, [np.array(x) for x in outputs]))
         return outputs
 
-    caches, lanes, largest = (loaded_code.generate, loaded_code.machine_code), processor.lanes, records.LARGEST
+    caches, lanes, largest = (loaded_code.generate, loaded_code.machine_code), processor.lanes, records.LARGEST_RECORDS
     for cache in caches:
         cache.cache_clear()
     # Sums over vectors depend on the size of a register.
     primitive.call_members = loaded_code.call_members = record
-    processor.lanes = lambda: VECTOR
-    records.LARGEST = 0  # as for the large batches of kernels
+    processor.lanes = lambda: VECTOR_LENGTH
+    records.LARGEST_RECORDS = 0  # as for the large batches of kernels
     try:
         with jax.disable_jit():
             function(*given)
     finally:
         primitive.call_members = loaded_code.call_members = call_members
-        processor.lanes, records.LARGEST = lanes, largest
+        processor.lanes, records.LARGEST_RECORDS = lanes, largest
         for cache in caches:
             cache.cache_clear()
     return [call for call in calls if call.outputs[0].shape[0] > 1]
@@ -65,7 +65,7 @@ def call_record(code: KernelCode, call: Called, addresses: Sequence[int], buffer
     """The call record of a kernel, from the addresses of its inputs and outputs; `buffer` has the fields of a buffer."""
     inputs, module = call.inputs, code.module
     names, arrays = (*INPUTS, *module.inputs, *module.results, *module.outputs), (*inputs, *call.outputs)
-    words = [len(call.outputs[0]), call.times, inputs[BREAKS].shape[1], inputs[-1].shape[module.directions_in]]
+    words = [len(call.outputs[0]), call.times, inputs[BREAKS_INPUT].shape[1], inputs[-1].shape[module.directions_in]]
     words += addresses[: len(inputs)]
     words += [x.size // len(x) if len(x) > 1 else 0 for x in inputs]
     words += addresses[len(inputs) :]

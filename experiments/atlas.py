@@ -40,7 +40,7 @@ from experiments.parts.atlas_runs import MAX_STEPS, TOLERANCES, parts, run
 from experiments.parts.atlas_tables import frame, geometric, silent
 from udkjax.scene import Mechanism, dumps
 from udkjax.show.style import COLOURS, MARKERS
-from udkjax.threads import SETTING, thread_count
+from udkjax.threads import THREADS_VARIABLE, thread_count
 
 SMALL = ("hanging", "crossing", "scissors")  # of the small version
 SPATIAL, LEAST_IN_SPACE = ("Bennett", "Bricard"), 0.5e-4  # chains that move by their dimensions, and their least safe threshold
@@ -128,7 +128,7 @@ def each(names: list[str], smoke: bool) -> Iterator[Results | list[dict[str, Any
 
 def alone() -> None:
     """Have a process compute on one core."""
-    os.environ[SETTING] = "1"
+    os.environ[THREADS_VARIABLE] = "1"
 
 
 def runs_of(name: str, smoke: bool) -> Results:

@@ -25,7 +25,7 @@ from experiments.parts.curve_runs import BARS, SEGMENTS, TIMES, Result, by_bfgs,
 from experiments.parts.curve_sets import LETTERS, classic_curves, curves_of_mechanisms, letter
 from udkjax.show.plots import COLOURS
 from udkjax.synthesis.curves.linkage_drawing import CLOSED_TO
-from udkjax.synthesis.curves.mechanisms_for import TRANSMISSION
+from udkjax.synthesis.curves.mechanisms_for import DEFAULT_TRANSMISSION
 
 SEEDED = "KRAEX"  # letters that are searched with several seeds
 MET, MEAN, SHARE = 0.005, 0.02, 0.9
@@ -109,7 +109,7 @@ def study(
     )
     if not smoke:
         shutil.rmtree(KEPT, ignore_errors=True)
-    return described(data, "linkages of a crank and dyads", {"rounds": rounds, "transmission": TRANSMISSION}, 0)
+    return described(data, "linkages of a crank and dyads", {"rounds": rounds, "transmission": DEFAULT_TRANSMISSION}, 0)
 
 
 def _letters(data: xarray.Dataset) -> xarray.Dataset:

@@ -20,8 +20,16 @@ from matplotlib.figure import Figure
 from experiments.common import described, panels, tracked
 from experiments.parts.nine_point_monodromy import check, complex_numbers, loops, random_four_bar
 from udkjax.show.plots import COLOURS
-from udkjax.synthesis.complete.dyads import JOINTS, POINTS
-from udkjax.synthesis.complete.nine_points import CLASSES, CLOSE, STARTS, distinct, find_real_classes, start_solutions, tracker
+from udkjax.synthesis.complete.dyads import DISPLACEMENTS, JOINT_UNKNOWNS
+from udkjax.synthesis.complete.nine_points import (
+    CLASS_COUNT,
+    CLOSE_PRECISION,
+    STARTS_FILE,
+    distinct,
+    find_real_classes,
+    start_solutions,
+    tracker,
+)
 from udkjax.synthesis.complete.path_tracking import ACCEPTED
 
 SEEDS = 3
@@ -40,7 +48,7 @@ def study(smoke: bool, seed: int = 1, write: int = 0) -> xarray.Dataset:
     for k, number in enumerate(tracked(seeds, "nine_points")):
         rng = np.random.default_rng(number)
         z, parameters = random_four_bar(rng)
-        for n, more in enumerate(loops(rng, z, parameters, most=SMOKE if smoke else CLASSES + 1)):
+        for n, more in enumerate(loops(rng, z, parameters, most=SMOKE if smoke else CLASS_COUNT + 1)):
             z, known[k, n:] = more, more.shape[1]
         found = check(z, parameters)
         off[k], failed[k], stored[k] = found["keys"], found["failed"], in_common(z, parameters)
@@ -61,14 +69,14 @@ def study(smoke: bool, seed: int = 1, write: int = 0) -> xarray.Dataset:
         },
         coords={"seed": list(seeds)},
     )
-    settings = {"precision": list(CLOSE), "loops": LOOPS, "places": PLACES}
+    settings = {"precision": list(CLOSE_PRECISION), "loops": LOOPS, "places": PLACES}
     return described(data, "two dyads (x, a) and (y, b) of one link in nine positions, in isotropic coordinates", settings, seed)
 
 
 def in_common(z: np.ndarray, parameters: np.ndarray) -> int:
     """Return how many solutions are stored ones, once they are followed to the displacements of those."""
     starts, displacements = start_solutions()
-    ends = tracker()(z, parameters, displacements, CLOSE)
+    ends = tracker()(z, parameters, displacements, CLOSE_PRECISION)
     moved = ends.z[:, ends.status == ACCEPTED]
     moved = moved[:, distinct(moved)]
     both = np.concatenate([starts, moved], axis=1)
@@ -79,19 +87,19 @@ def write_starts(rng: np.random.Generator, z: np.ndarray, parameters: np.ndarray
     """Write the file of starts, at the best of some random displacements."""
     best, size = None, np.inf
     for _ in range(PLACES):
-        place = complex_numbers(rng, 2 * POINTS)
-        ends = tracker()(z, parameters, place, CLOSE)
-        if (ends.status == ACCEPTED).all() and len(distinct(ends.z)) == CLASSES and np.abs(ends.z).max() < size:
-            best, size = (ends.z[:JOINTS], place), np.abs(ends.z).max()
+        place = complex_numbers(rng, 2 * DISPLACEMENTS)
+        ends = tracker()(z, parameters, place, CLOSE_PRECISION)
+        if (ends.status == ACCEPTED).all() and len(distinct(ends.z)) == CLASS_COUNT and np.abs(ends.z).max() < size:
+            best, size = (ends.z[:JOINT_UNKNOWNS], place), np.abs(ends.z).max()
     if best is None:
         raise RuntimeError("no displacements were reached by all solutions: take another seed")
-    np.savez(STARTS, joints=best[0], displacements=best[1])
+    np.savez(STARTS_FILE, joints=best[0], displacements=best[1])
 
 
 def holds(data: xarray.Dataset) -> dict[str, bool]:
     """The count is the same for all seeds, cognates are solutions, and so are the stored ones."""
     last = data.known[:, -1]
-    full = CLASSES if not data.attrs["smoke"] else SMOKE
+    full = CLASS_COUNT if not data.attrs["smoke"] else SMOKE
     return {
         "all seeds find the classes": bool((last == full).all() if not data.attrs["smoke"] else (last >= full).all()),
         "known classes nearly double in the first loops": bool((data.known[:, 3] >= 8).all()),
@@ -99,7 +107,7 @@ def holds(data: xarray.Dataset) -> dict[str, bool]:
             (data.off < MATCH).all() and (data.failed < 0.01 * 2 * last).all()
         ),
         "they are those that are stored": bool((data.stored == last).all()),
-        "random points have all solutions": bool((data.regular == CLASSES).mean() >= 0.9 and (data.unproven == 0).all()),
+        "random points have all solutions": bool((data.regular == CLASS_COUNT).mean() >= 0.9 and (data.unproven == 0).all()),
         "some of them are real": bool((data.real_classes >= 1).all()),
     }
 
@@ -111,7 +119,7 @@ def headline(data: xarray.Dataset) -> str:
     return (
         f"{', '.join(map(str, known[:, -1]))} classes after {taken.min()} to {taken.max()} loops; "
         f"{int(data.stored.min())} are stored; {len(real)} random sets have {int(real.min())} to {int(real.max())} real classes, "
-        f"median {np.median(real):g}; all {CLASSES} were found for {int((data.regular == CLASSES).sum())} sets"
+        f"median {np.median(real):g}; all {CLASS_COUNT} were found for {int((data.regular == CLASS_COUNT).sum())} sets"
     )
 
 
@@ -120,7 +128,7 @@ def figure(data: xarray.Dataset) -> Figure:
     figure, ((left, right),) = panels(1, 2, 9.0, 3.6)
     for row, seed in enumerate(data.seed.values):
         left.semilogy(1 + np.arange(data.sizes["loop"]), data.known[row], "o-", ms=3, color=COLOURS[row], label=f"seed {seed}")
-    left.axhline(CLASSES, color="0.5", lw=0.8)
+    left.axhline(CLASS_COUNT, color="0.5", lw=0.8)
     left.set(xlabel="loop", ylabel="classes known", title="Monodromy from one four-bar")
     left.legend(fontsize="small", frameon=False)
     right.hist(data.real_classes, bins=20, color=COLOURS[0])

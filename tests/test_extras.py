@@ -73,4 +73,4 @@ def test_extras_that_bring_others_are_those_of_the_project():
         named = {name for line in optional[extra] if line.startswith("udkjax[") for name in line[7:-1].split(",")}
         return named.union(*map(brought, named))
 
-    assert {x: set(extras.BRINGS.get(x, ())) for x in EXTRAS.values()} == {x: brought(x) for x in EXTRAS.values()}
+    assert {x: set(extras.IMPLIED_EXTRAS.get(x, ())) for x in EXTRAS.values()} == {x: brought(x) for x in EXTRAS.values()}

@@ -31,7 +31,7 @@ from udkjax.equations.rows.analysis import _with_rank_tol
 from udkjax.equations.rows.dense_rows import DenseRows
 from udkjax.equations.rows.redundancy import examine_rows
 from udkjax.integrate.solvers import method_of
-from udkjax.native.module.steps import LIMIT, STABLE
+from udkjax.native.module.steps import STABILITY_LIMIT, STIFF_LIMIT
 from udkjax.study.tolerancing.dimensions import ToleratedNumbers
 
 pytestmark = pytest.mark.slow
@@ -247,28 +247,36 @@ def least_gaps() -> dict[str, Any]:
 
 
 CASES: dict[str, tuple[Callable[[], dict[str, Any]], tuple[str, ...], float]] = {
-    "FITS": (held_pins, ("equations.rows.stationary_rows.FITS",), 0.0),
-    "SMALL": (held_pins, ("equations.rows.stationary_rows.SMALL",), 0.0),
-    "SAME": (geared_rows, ("equations.rows.balance.SAME",), 0.0),
-    "ANCHOR": (geared_rows, ("equations.rows.balance.ANCHOR",), 0.0),
+    "SQUARE_FIT_TOL": (held_pins, ("equations.rows.stationary_rows.SQUARE_FIT_TOL",), 0.0),
+    "SMALL_SINGULAR_VALUE": (held_pins, ("equations.rows.stationary_rows.SMALL_SINGULAR_VALUE",), 0.0),
+    "CONSTANT_COEFFICIENT_TOL": (geared_rows, ("equations.rows.balance.CONSTANT_COEFFICIENT_TOL",), 0.0),
+    "ANCHOR_WEIGHT": (geared_rows, ("equations.rows.balance.ANCHOR_WEIGHT",), 0.0),
     "GEARED_SHARE": (geared_rows, ("equations.rows.analysis.GEARED_SHARE",), 0.0),
-    "BLOCKED_IN_SYSTEM": (impacts_of_systems, ("integrate.events.instant.impacts.BLOCKED_IN_SYSTEM",), 0.0),
-    "LONGEST": (feet_in_turns, ("integrate.events.instant.hops.LONGEST",), 1e-9),
+    "BLOCKED_IN_SYSTEM_TOL": (impacts_of_systems, ("integrate.events.instant.impacts.BLOCKED_IN_SYSTEM_TOL",), 0.0),
+    "LONGEST_FALL": (feet_in_turns, ("integrate.events.instant.hops.LONGEST_FALL",), 1e-9),
     "MOST_ROWS": (matrices_in_forces, ("expressions.reading.matrix_rules.MOST_ROWS",), 1e-8),
-    "REPETITIONS": (sticking_joints, ("complementarity.stick_or_slip.REPETITIONS",), 1e-9),
+    "LIMIT_ITERATIONS": (sticking_joints, ("complementarity.stick_or_slip.LIMIT_ITERATIONS",), 1e-9),
     "SWEEPS": (sticking_joints, ("complementarity.stick_or_slip.SWEEPS",), 1e-9),
-    "SAME_SHARE": (sticking_joints, ("complementarity.stick_or_slip.SAME_SHARE",), 1e-9),
+    "SHARE_TOL": (sticking_joints, ("complementarity.stick_or_slip.SHARE_TOL",), 1e-9),
     "BLOCK_STEPS": (sticking_joints, ("complementarity.stick_or_slip.BLOCK_STEPS",), 1e-9),
     "SINGLE_STEPS": (sticking_joints, ("complementarity.stick_or_slip.SINGLE_STEPS",), 1e-9),
-    "SETTLED": (rubbing_joints, ("equations.elimination.friction_elimination.SETTLED",), 1e-8),
+    "LOAD_CHANGE_TOL": (rubbing_joints, ("equations.elimination.friction_elimination.LOAD_CHANGE_TOL",), 1e-8),
     "LAST_CHANGE": (rubbing_joints, ("transforms.newton_steps.LAST_CHANGE",), 1e-8),
-    "ROUNDS": (rubbing_joints, ("equations.elimination.friction_elimination.ROUNDS",), 1e-8),
+    "FRICTION_ROUNDS": (rubbing_joints, ("equations.elimination.friction_elimination.FRICTION_ROUNDS",), 1e-8),
     "SETTLING_ROUNDS": (rubbing_joints, ("native.module.steps.SETTLING_ROUNDS",), 1e-8),
     "MOST_STEPS": (rubbing_joints, ("transforms.newton_steps.MOST_STEPS",), 1e-8),
-    "BLOCKS, HELD": (held_mechanisms, tuple(f"complementarity.linear_program.{x}" for x in ("BLOCKS", "HELD")), 1e-9),
+    "BLOCKING_TOL, OPTIMALITY_TOL": (
+        held_mechanisms,
+        tuple(f"complementarity.linear_program.{x}" for x in ("BLOCKING_TOL", "OPTIMALITY_TOL")),
+        1e-9,
+    ),
     "STEPS_PER_ROW": (held_mechanisms, ("complementarity.linear_program.STEPS_PER_ROW",), 1e-9),
-    "STOPPED": (held_mechanisms, ("statics.holding.STOPPED",), 1e-9),
-    "UNBALANCED, LOADED": (held_mechanisms, tuple(f"statics.admissible_reactions.{x}" for x in ("UNBALANCED", "LOADED")), 1e-9),
+    "STOPPED_TOL": (held_mechanisms, ("statics.holding.STOPPED_TOL",), 1e-9),
+    "UNBALANCED_TOL, LOADED_TOL": (
+        held_mechanisms,
+        tuple(f"statics.admissible_reactions.{x}" for x in ("UNBALANCED_TOL", "LOADED_TOL")),
+        1e-9,
+    ),
     "tangents": (
         held_mechanisms,
         tuple(f"statics.admissible_reactions.{x}" for x in ("MOST_TANGENTS", "LAST_CHANGE", "STEP_ASIDE", "PRELOAD")),
@@ -276,22 +284,29 @@ CASES: dict[str, tuple[Callable[[], dict[str, Any]], tuple[str, ...], float]] = 
     ),
     "STAGE_ROUNDS": (rubbing_joints, ("native.module.steps.STAGE_ROUNDS",), 1e-8),
     "LARGE_CORRECTION": (rubbing_joints, ("equations.elimination.friction_elimination.LARGE_CORRECTION",), 1e-8),
-    "SLOW": (sticking_joints, ("integrate.events.law.crossings.SLOW",), 1e-9),
+    "REVERSAL_SPEED": (sticking_joints, ("integrate.events.law.crossings.REVERSAL_SPEED",), 1e-9),
     "STAGES": (rubbing_joints, ("equations.programs.run_programs.RunPrograms.STAGES",), 1e-8),
     "MOST_AIMS": (located_events, ("native.watching.conditions.MOST_AIMS",), 1e-8),
     "MOST_LANDINGS": (located_events, ("native.watching.conditions.MOST_LANDINGS",), 1e-8),
     "LAST_CHANGE, of events": (located_events, ("native.watching.conditions.LAST_CHANGE",), 1e-8),
     "LEAST_STEP": (located_events, ("native.watching.conditions.LEAST_STEP",), 1e-8),
     "SHORT_STEP": (located_events, ("native.module.steps.SHORT_STEP",), 1e-8),
-    "WORTH": (rests, ("equations.programs.eliminated_steps.WORTH",), 1e-9),
-    "CLEAR": (rests, ("equations.programs.eliminated_steps.CLEAR",), 1e-9),
+    "USES_BEFORE_ELIMINATION": (rests, ("equations.programs.eliminated_steps.USES_BEFORE_ELIMINATION",), 1e-9),
+    "LEAST_DISTANCE": (rests, ("equations.programs.eliminated_steps.LEAST_DISTANCE",), 1e-9),
     "FEW_OPERATIONS": (rests, ("expressions.loops.float_loops.FEW_OPERATIONS",), 1e-9),
-    "ROUNDS, of starts": (designs, ("synthesis.starts.ROUNDS",), 1e-6),
+    "ASSIGNING_ROUNDS": (designs, ("synthesis.starts.ASSIGNING_ROUNDS",), 1e-6),
     "LEAST_FALL": (designs, ("synthesis.search.LEAST_FALL",), 1e-6),
-    "HIDES": (hidden_numbers, ("study.tolerancing.dimensions.HIDES",), 0.0),
+    "LEAST_EFFECT": (hidden_numbers, ("study.tolerancing.dimensions.LEAST_EFFECT",), 0.0),
     **{
         name: (least_gaps, (f"positions.gaps.{name}",), 1e-9)
-        for name in ("search.PROVEN", "search.OPENED", "search.BESIDE", "search.LAST_STEP", "search.STEEP", "motion.FOLLOWED")
+        for name in (
+            "search.PROVEN_TOL",
+            "search.OPENING_TOL",
+            "search.KINK_OFFSET",
+            "search.LAST_STEP",
+            "search.STEEP_FRACTION",
+            "motion.POLYNOMIAL_TOL",
+        )
     },
     "KEEPS_SIDE": (followed_turns, ("native.closing.marching.KEEPS_SIDE",), 1e-8),
     "CLEARLY_ALONG": (linearized_rests, ("statics.linearization.CLEARLY_ALONG",), 1e-9),
@@ -328,14 +343,14 @@ def test_ten_times(name, factor):
 
 
 def test_what_limits_explicit_steps_is_the_stability_of_dopri8():
-    """|R(z)| <= 1 up to z = -STABLE, and up to five fourths of LIMIT along the imaginary axis: steps are four fifths as long."""
+    """|R(z)| <= 1 up to z = -STABILITY_LIMIT, and up to 5/4 STIFF_LIMIT along the imaginary axis: steps are 4/5 as long."""
     A, b = method_of(None).v[:-1], method_of(None).v[-1]
     one = np.ones(len(b))
 
     def growth(z: complex) -> float:
         return abs(1 + z * (b @ np.linalg.solve(np.eye(len(b)) - z * A, one)))
 
-    for axis, bound in ((-1.0, STABLE), (1j, 1.25 * LIMIT)):
+    for axis, bound in ((-1.0, STABILITY_LIMIT), (1j, 1.25 * STIFF_LIMIT)):
         assert all(growth(axis * bound * share) <= 1 + 1e-3 for share in np.linspace(0.01, 0.97, 50)), axis
         assert growth(axis * bound * 1.25) > 1.05, axis
 
@@ -343,6 +358,6 @@ def test_what_limits_explicit_steps_is_the_stability_of_dopri8():
 def test_early_trials_of_implicit_steps_change_little():
     """Trials begin far from the limit, or are as long as has to pay: stiff runs go on implicitly, others never."""
     expected = usual(stiff_runs)
-    for factor, name in ((0.1, "LIMIT"), (0.5, "CLEARLY"), (2.0, "CLEARLY")):
+    for factor, name in ((0.1, "STIFF_LIMIT"), (0.5, "PAYING_MARGIN"), (2.0, "PAYING_MARGIN")):
         with multiplied(factor, f"native.module.steps.{name}"):
             assert_same(stiff_runs(), expected, 3e-5)

@@ -92,7 +92,7 @@ def run_without_contraction(module: Any, inputs: Sequence[np.ndarray], shapes: S
 
     llvm = processor.llvm()
     target = llvm.Target.from_default_triple().create_target_machine(
-        cpu="generic", features="-fma,-fma4", opt=machine.LEVEL, reloc="pic", codemodel="small", jit=True
+        cpu="generic", features="-fma,-fma4", opt=machine.OPTIMIZATION_LEVEL, reloc="pic", codemodel="small", jit=True
     )
     code = machine.object_code(module.written_text, target, llvm.get_default_triple())
     library = machine.Library([code], ("run",))

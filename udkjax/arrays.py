@@ -159,7 +159,7 @@ class TreeMethod:
         if instance is None:
             return self.function
         method = Partial(function := self.function, instance)
-        vars(method).update({key: getattr(function, key) for key in _DESCRIPTION})
+        vars(method).update({key: getattr(function, key) for key in _COPIED_ATTRIBUTES})
         return method
 
 
@@ -180,7 +180,7 @@ class QuickMethods(eqx.Module):
                     setattr(cls, name, TreeMethod(value))
 
 
-_DESCRIPTION = "__doc__", "__name__", "__qualname__", "__module__"
+_COPIED_ATTRIBUTES = "__doc__", "__name__", "__qualname__", "__module__"
 
 
 _FLOAT64, _FLOAT32 = np.dtype(np.float64), np.dtype(np.float32)

@@ -28,7 +28,7 @@ EXTRAS = {
     "ziglang": "zig",
 }
 # Extras that others bring along.
-BRINGS = {
+IMPLIED_EXTRAS = {
     "identify": ("io",),
     "bayes": ("io", "identify"),
     "cli": ("io", "plot", "identify"),
@@ -39,12 +39,12 @@ BRINGS = {
     "studio": ("cli", "io", "plot", "identify"),
 }
 # The packages that write a pose or a film, by the suffix of its file.
-WRITERS = {".png": ("PIL",), ".gif": ("PIL",), ".mp4": ("PIL", "imageio_ffmpeg"), ".dxf": ("ezdxf",)}
-NETCDF = "xarray", "h5netcdf"  # the packages that read and write runs
-BAYES = ("arviz",)  # the package that judges draws from posteriors
-EXPORT = ("flatbuffers",)  # the package with which JAX writes exported functions
-ZIG = ("ziglang",)  # the package with a C compiler for all platforms
-STUDIO = "starlette", "uvicorn", "tomlkit"  # the packages that serve the studio
+WRITING_PACKAGES = {".png": ("PIL",), ".gif": ("PIL",), ".mp4": ("PIL", "imageio_ffmpeg"), ".dxf": ("ezdxf",)}
+NETCDF_PACKAGES = "xarray", "h5netcdf"  # the packages that read and write runs
+BAYES_PACKAGES = ("arviz",)  # the package that judges draws from posteriors
+EXPORT_PACKAGES = ("flatbuffers",)  # the package with which JAX writes exported functions
+ZIG_PACKAGES = ("ziglang",)  # the package with a C compiler for all platforms
+STUDIO_PACKAGES = "starlette", "uvicorn", "tomlkit"  # the packages that serve the studio
 
 
 class MissingExtraError(ModuleNotFoundError):
@@ -77,7 +77,7 @@ def require(*packages: str) -> None:
 def cure(missing: Sequence[str]) -> str:
     """Return a message that names missing packages, with the command that installs them by as few extras as possible."""
     extras = {EXTRAS[package] for package in missing}
-    brought = {other for extra in extras for other in BRINGS.get(extra, ())}
+    brought = {other for extra in extras for other in IMPLIED_EXTRAS.get(extra, ())}
     names = ",".join(sorted(extras - brought))
     packages = " and ".join(filter(None, [", ".join(missing[:-1]), missing[-1]]))
     return f"{packages} {'is' if len(missing) == 1 else 'are'} not installed: pip install 'udkjax[{names}]'"

@@ -18,7 +18,7 @@ MOST_HTML_ROWS = 30  # rows of a table in a notebook, which can be scrolled
 MOST_NUMBERS = 6  # entries of an array that are printed; larger arrays print their shape and range
 MOST_CHARACTERS = 96  # of a cell
 MOST_LINE = 400  # characters of an object that prints on one line
-DIGITS = 6  # significant digits in tables, enough to compare runs by eye
+SIGNIFICANT_DIGITS = 6  # significant digits in tables, enough to compare runs by eye
 PRINTED_AS_ZERO = 4096 * np.finfo(float).eps  # relative to the largest nearby number: accumulated rounding errors print as 0
 
 Plain = bool | int | float | complex | np.ndarray | np.generic
@@ -103,7 +103,7 @@ def _is_stored(leaf: object) -> bool:
 def format_number(value: Any, unit: str = "", scale: float = 0.0) -> str:
     """Return one number with six digits and its unit; a number that is a rounding error relative to `scale` becomes 0."""
     number = complex(value) if np.iscomplexobj(value) else float(value)
-    text = f"{0.0 if abs(number) <= PRINTED_AS_ZERO * scale else number:.{DIGITS}g}"
+    text = f"{0.0 if abs(number) <= PRINTED_AS_ZERO * scale else number:.{SIGNIFICANT_DIGITS}g}"
     return f"{text} {unit}" if unit else text
 
 

@@ -10,10 +10,10 @@ from typing import Any, Literal
 
 from typing_extensions import TypeAliasType
 
-PATIENCE = 2.0  # s; shorter computations show no progress
+QUIET_SECONDS = 2.0  # s; shorter computations show no progress
 TERMINAL_INTERVAL, FILE_INTERVAL = 0.2, 15.0  # s between updates of a line in a terminal, and of lines in a file
 
-BAR = "{desc}: {percentage:3.0f}%|{bar}| {elapsed}<{remaining}{postfix}"
+BAR_FORMAT = "{desc}: {percentage:3.0f}%|{bar}| {elapsed}<{remaining}{postfix}"
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class Report:
 
 @contextmanager
 def report_progress(
-    progress: ProgressOption, total: float | None, what: str, patience: float = PATIENCE, interval: float | None = None
+    progress: ProgressOption, total: float | None, what: str, patience: float = QUIET_SECONDS, interval: float | None = None
 ) -> Iterator[Report]:
     """Report the progress of the computation in the body of a `with` statement.
 
@@ -119,7 +119,7 @@ class _Line:
     def _open(self) -> None:
         from tqdm.auto import tqdm
 
-        layout = "{desc}: {elapsed}{postfix}" if self.total is None else BAR
+        layout = "{desc}: {elapsed}{postfix}" if self.total is None else BAR_FORMAT
         with self.lock:
             bar = tqdm(
                 desc=self.what, total=self.total, file=sys.stderr, mininterval=self.interval, miniters=0, bar_format=layout

@@ -18,7 +18,7 @@ from udkjax.wording import abbreviate, article
 GivenArguments = Mapping[str, Any]  # all arguments of a call by name, including defaults
 ArgumentCheck = Callable[..., None]  # (name, value, given): an argument, and all arguments of the call
 Sign = Literal["any", "positive", "not negative"]
-NOTHING: GivenArguments = MappingProxyType({})
+NO_ARGUMENTS: GivenArguments = MappingProxyType({})
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
 
@@ -70,7 +70,9 @@ def array(name: str, value: Any) -> "np.ndarray | Tracer":
     return numbers
 
 
-def require_number(name: str, value: Any, sign: Sign = "any", infinite: bool = False, given: GivenArguments = NOTHING) -> None:
+def require_number(
+    name: str, value: Any, sign: Sign = "any", infinite: bool = False, given: GivenArguments = NO_ARGUMENTS
+) -> None:
     """Require one real number of a sign; it must be finite unless `infinite`.
 
     Of a traced number, only shape and dtype are checked.
@@ -107,13 +109,13 @@ def are_names(value: Any) -> bool:
     return isinstance(value, Sequence) and not isinstance(value, str) and all(isinstance(name, str) for name in value)
 
 
-def require_names(name: str, value: Any, given: GivenArguments = NOTHING) -> None:
+def require_names(name: str, value: Any, given: GivenArguments = NO_ARGUMENTS) -> None:
     """Require a list of names."""
     if not are_names(value):
         raise ArgumentTypeError(f"{name} must be a list of names, {describe(value)}")
 
 
-def require_numbers_by_name(name: str, value: Any, given: GivenArguments = NOTHING) -> None:
+def require_numbers_by_name(name: str, value: Any, given: GivenArguments = NO_ARGUMENTS) -> None:
     """Require a mapping of names to finite numbers."""
     if not (isinstance(value, Mapping) and all(isinstance(key, str) for key in value)):
         raise ArgumentTypeError(f"{name} must map names to numbers, such as {{name: number}}, {describe(value)}")
@@ -121,7 +123,7 @@ def require_numbers_by_name(name: str, value: Any, given: GivenArguments = NOTHI
         require_number(f"{name}[{key!r}]", number)
 
 
-def require_name_or_names(name: str, value: Any, given: GivenArguments = NOTHING) -> None:
+def require_name_or_names(name: str, value: Any, given: GivenArguments = NO_ARGUMENTS) -> None:
     """Require a name, or a list of names."""
     if not (isinstance(value, str) or are_names(value)):
         raise ArgumentTypeError(f"{name} must be a name, or a list of names, {describe(value)}")
@@ -164,7 +166,7 @@ def tracing(where: str) -> Iterator[None]:
         raise
 
 
-def require_count(name: str, value: Any, least: float = 1, given: GivenArguments = NOTHING) -> None:
+def require_count(name: str, value: Any, least: float = 1, given: GivenArguments = NO_ARGUMENTS) -> None:
     """Require an integer, at least `least`; of a traced number, only shape and dtype are checked."""
     number = None if isinstance(value, bool | np.bool_) else array(name, value)
     if number is None or number.shape != () or not jnp.issubdtype(number.dtype, jnp.integer):
@@ -173,7 +175,9 @@ def require_count(name: str, value: Any, least: float = 1, given: GivenArguments
         raise ArgumentError(f"{name} must be at least {least:g}, not {int(number)}")
 
 
-def require_finite(name: str, value: Any, place: Callable[..., str] = lambda *index: "", given: GivenArguments = NOTHING) -> None:
+def require_finite(
+    name: str, value: Any, place: Callable[..., str] = lambda *index: "", given: GivenArguments = NO_ARGUMENTS
+) -> None:
     """Require that numbers are finite; traced numbers are not checked.
 
     `place` returns a description of the entry with given indices, which follows the entry's value in the message.
@@ -186,7 +190,7 @@ def require_finite(name: str, value: Any, place: Callable[..., str] = lambda *in
     raise ArgumentError(f"{name}{where} is {numbers[index]:g}{place(*index)}: it must be finite")
 
 
-def require_times(name: str, value: Any, given: GivenArguments = NOTHING) -> None:
+def require_times(name: str, value: Any, given: GivenArguments = NO_ARGUMENTS) -> None:
     """Require a vector of finite times; of a traced vector, only the shape is checked."""
     times = array(name, value)
     if times.ndim != 1 or not len(times):
@@ -194,7 +198,7 @@ def require_times(name: str, value: Any, given: GivenArguments = NOTHING) -> Non
     require_finite(name, times)
 
 
-def require_output_times(name: str, value: Any, given: GivenArguments = NOTHING) -> None:
+def require_output_times(name: str, value: Any, given: GivenArguments = NO_ARGUMENTS) -> None:
     """Require at least two finite, increasing times; of traced times, only the shape is checked."""
     times = array(name, value)
     if times.ndim != 1 or len(times) < 2:

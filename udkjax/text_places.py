@@ -13,10 +13,11 @@ PagePoint = Float[np.ndarray, "2"]
 Box = tuple[PagePoint, PagePoint, PagePoint]  # middle, and half of two sides that are at right angles
 Segment = tuple[PagePoint, PagePoint]
 
-WIDE = 0.58  # usual width of a letter, relative to its height
-SAMPLES = 9  # places of a text that are tested
-AROUND = [[9, -12, 0], [9, 14, 0], [-9, -12, 1], [-9, 14, 1], [0, -20, 0.5], [0, 22, 0.5]]  # a pin: shift, and share to the left
-OUTSIDE, ON_TEXT, ON_LINE = 4.0, 2.0, 1.0  # costs of a tested place outside the picture, on other texts, on lines
+LETTER_WIDTH = 0.58  # usual width of a letter, relative to its height
+TEXT_SAMPLES = 9  # places of a text that are tested
+# A pin: shift, and share to the left.
+PLACES_AROUND_PIN = [[9, -12, 0], [9, 14, 0], [-9, -12, 1], [-9, 14, 1], [0, -20, 0.5], [0, 22, 0.5]]
+OUTSIDE_COST, ON_TEXT_COST, ON_LINE_COST = 4.0, 2.0, 1.0  # costs of a tested place outside the picture, on other texts, on lines
 
 
 class TextPlaces:
@@ -36,7 +37,7 @@ class TextPlaces:
 
     def width(self, words: str) -> float:
         """Return the usual width of a text."""
-        return WIDE * self.size * len(words)
+        return LETTER_WIDTH * self.size * len(words)
 
     def level(self, middle: PagePoint, words: str) -> Box:
         """Return the box of a text that is written along x around a middle."""
@@ -72,21 +73,21 @@ class TextPlaces:
         Args:
             place: the pin.
             words: the name.
-            unit: unit of the shifts in `AROUND`, in the unit of the picture.
+            unit: unit of the shifts in `PLACES_AROUND_PIN`, in the unit of the picture.
         """
         wide = self.width(words)
-        shifts = [((0.5 - share) * wide + dx * unit, dy * unit) for dx, dy, share in AROUND]
+        shifts = [((0.5 - share) * wide + dx * unit, dy * unit) for dx, dy, share in PLACES_AROUND_PIN]
         return self.put([place + np.array(shift) for shift in shifts], words)
 
     def _cost(self, box: Box, own: Segment | None, more: Sequence[PagePoint]) -> float:
         middle, u, v = box
-        places = middle + np.array([s * u + t * v for s in np.linspace(-1, 1, SAMPLES) for t in (-1, 0, 1)])
+        places = middle + np.array([s * u + t * v for s in np.linspace(-1, 1, TEXT_SAMPLES) for t in (-1, 0, 1)])
         outside = np.any((places < 0) | (places > self.limits), axis=1).sum()
-        cost = OUTSIDE * float(outside + sum(np.any((p < 0) | (p > self.limits)) for p in more))
+        cost = OUTSIDE_COST * float(outside + sum(np.any((p < 0) | (p > self.limits)) for p in more))
         for other, a, b in self.boxes:
             d = places - other
-            cost += ON_TEXT * float(np.sum((np.abs(d @ a) <= a @ a) & (np.abs(d @ b) <= b @ b)))
+            cost += ON_TEXT_COST * float(np.sum((np.abs(d @ a) <= a @ a) & (np.abs(d @ b) <= b @ b)))
         for line in self.lines:
             if own is None or (line is not own and not all(np.allclose(x, y) for x, y in zip(line, own, strict=True))):
-                cost += ON_LINE * float(np.sum(distances_from_segments(places, *np.array(line)[:, None]) < self.size / 2))
+                cost += ON_LINE_COST * float(np.sum(distances_from_segments(places, *np.array(line)[:, None]) < self.size / 2))
         return cost

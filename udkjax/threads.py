@@ -6,7 +6,7 @@ from functools import cache
 
 from udkjax.requirements import ArgumentError
 
-SETTING = "UDKJAX_THREADS"
+THREADS_VARIABLE = "UDKJAX_THREADS"
 
 
 def cores() -> int:
@@ -20,11 +20,11 @@ def thread_limit() -> int | None:
     Raises:
         ArgumentError: the value is not a positive whole number.
     """
-    text = os.environ.get(SETTING, "").strip()
+    text = os.environ.get(THREADS_VARIABLE, "").strip()
     if not text:
         return None
     if not (text.isascii() and text.isdecimal() and int(text)):
-        raise ArgumentError(f"{SETTING} must be a whole number of threads, 1 or more, not {text!r}")
+        raise ArgumentError(f"{THREADS_VARIABLE} must be a whole number of threads, 1 or more, not {text!r}")
     return int(text)
 
 

@@ -16,7 +16,7 @@ from udkjax.synthesis.curves.curve_search import CurveSearch
 from udkjax.synthesis.curves.descent import Task, evaluate
 from udkjax.synthesis.curves.dyads import Topology
 from udkjax.synthesis.curves.matching import find_starts
-from udkjax.synthesis.curves.mechanisms_for import SIZE, TRANSMISSION, curve_limits
+from udkjax.synthesis.curves.mechanisms_for import DEFAULT_SIZE, DEFAULT_TRANSMISSION, curve_limits
 from udkjax.synthesis.curves.targets import WantedCurve
 
 BARS = (4, 6, 8, 10, 12)
@@ -90,7 +90,7 @@ def check(design: CurveDesign, curve: np.ndarray) -> Result:
     return {
         "turned": bool(np.all(motion.reached) and back < SAME * size),
         "open": float(gap / (size + np.linalg.norm(middle))),
-        "size": size / (SIZE * wanted.extent),
+        "size": size / (DEFAULT_SIZE * wanted.extent),
         "off": float(cKDTree(design.curve).query(drawn)[0].max() / wanted.extent),
         "following": spent,
     }
@@ -106,7 +106,7 @@ def _links(design: CurveDesign) -> list[list[list[float]]]:
 def by_bfgs(curve: np.ndarray, seconds: float, bars: int, seed: int) -> Result:
     """Return the least error of random linkages that BFGS improves one after another for CPU seconds."""
     wanted = WantedCurve(curve)
-    one_by_one = CurveSearch(wanted, curve_limits(wanted, None, TRANSMISSION), bars, seed)
+    one_by_one = CurveSearch(wanted, curve_limits(wanted, None, DEFAULT_TRANSMISSION), bars, seed)
     begun, best, dyads = time.process_time(), np.inf, (bars - 2) // 2
     starts, topology = find_starts(wanted, one_by_one.limits, dyads, STARTS, STARTS, np.random.default_rng(seed))
     low, high = (

@@ -5,7 +5,7 @@ import svgelements
 
 from udkjax.synthesis.curves.curve_file import FRACTIONS
 from udkjax.synthesis.curves.dyad_forms import PINS
-from udkjax.synthesis.curves.dyads import BASE, EACH, HEAD, SECOND, Topology, number_count, positions
+from udkjax.synthesis.curves.dyads import BASE_LINKS, DYAD_NUMBERS, HEAD_NUMBERS, SECOND_PIVOT, Topology, number_count, positions
 from udkjax.synthesis.curves.targets import as_points
 
 LETTERS = {
@@ -76,13 +76,15 @@ def curves_of_mechanisms(count: int, rng: np.random.Generator) -> list[np.ndarra
     theta = np.linspace(0.0, 2.0 * np.pi, 361)[None]
     while len(curves) < count:
         dyads = 1 + len(curves) % 3
-        second_crank, links = np.arange(SECOND, HEAD), BASE + 2 * np.arange(dyads)
-        x = np.insert(rng.uniform(-2.0, 2.0, number_count(dyads) - len(second_crank)), [SECOND] * len(second_crank), 0.0)[None]
-        x[0, HEAD : HEAD + 2] = rng.uniform(0.3, 1.0), 0.0
-        for k in HEAD + EACH * np.arange(dyads):
+        second_crank, links = np.arange(SECOND_PIVOT, HEAD_NUMBERS), BASE_LINKS + 2 * np.arange(dyads)
+        x = np.insert(rng.uniform(-2.0, 2.0, number_count(dyads) - len(second_crank)), [SECOND_PIVOT] * len(second_crank), 0.0)[
+            None
+        ]
+        x[0, HEAD_NUMBERS : HEAD_NUMBERS + 2] = rng.uniform(0.3, 1.0), 0.0
+        for k in HEAD_NUMBERS + DYAD_NUMBERS * np.arange(dyads):
             x[0, k + 4 : k + 6] = rng.uniform(0.7, 3.0, 2)
         first = np.array([[1, *(links[1:] - rng.integers(1, 3, dyads - 1))]])
-        second = np.where(rng.random((1, dyads)) < 0.5, 0, np.maximum(first - 2, 0) * (first > BASE + 1))
+        second = np.where(rng.random((1, dyads)) < 0.5, 0, np.maximum(first - 2, 0) * (first > BASE_LINKS + 1))
         at = positions(
             x,
             Topology(first, second, rng.choice([-1.0, 1.0], (1, dyads)), np.full((1, dyads), PINS), np.zeros(1, int)),

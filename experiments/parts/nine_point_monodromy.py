@@ -11,17 +11,17 @@ from itertools import pairwise
 
 import numpy as np
 
-from udkjax.synthesis.complete.dyads import JOINTS, POINTS
-from udkjax.synthesis.complete.nine_points import CLASSES, CLOSE, class_keys, distinct, tracker, turns_of
+from udkjax.synthesis.complete.dyads import DISPLACEMENTS, JOINT_UNKNOWNS
+from udkjax.synthesis.complete.nine_points import CLASS_COUNT, CLOSE_PRECISION, class_keys, distinct, tracker, turns_of
 from udkjax.synthesis.complete.path_tracking import ACCEPTED
 
 
 def random_four_bar(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Return a solution (16, 1) and the displacements (16,) that it solves."""
-    joints = complex_numbers(rng, JOINTS)
+    joints = complex_numbers(rng, JOINT_UNKNOWNS)
     pairs = [(x, X, x - r, X - R) for x, X, r, R in (joints[:4], joints[4:])]
-    d, D, turns = (np.zeros(POINTS, complex) for _ in range(3))
-    for j in range(POINTS):
+    d, D, turns = (np.zeros(DISPLACEMENTS, complex) for _ in range(3))
+    for j in range(DISPLACEMENTS):
         t = turns[j] = np.exp(complex_numbers(rng, 1)[0])
         first, other = (np.array([X / t - A, t * x - a, x * A * (1 - t) + X * a * (1 - 1 / t)]) for x, X, a, A in pairs)
         p, q, r = first - other  # p d + q D + r = 0, and the first dyad's d D + ... = 0
@@ -36,14 +36,14 @@ def complex_numbers(rng: np.random.Generator, *shape: int) -> np.ndarray:
 
 
 def loops(
-    rng: np.random.Generator, z: np.ndarray, parameters: np.ndarray, idle: int = 3, most: int = CLASSES
+    rng: np.random.Generator, z: np.ndarray, parameters: np.ndarray, idle: int = 3, most: int = CLASS_COUNT
 ) -> Iterator[np.ndarray]:
     """Yield the known solutions (16, M) after each loop; end after some in a row without new ones, or with `most` solutions."""
     tired = 0
     while tired < idle and z.shape[1] < most:
-        corners, moved = [parameters, *complex_numbers(rng, 2, 2 * POINTS), parameters], z
+        corners, moved = [parameters, *complex_numbers(rng, 2, 2 * DISPLACEMENTS), parameters], z
         for start, end in pairwise(corners):
-            ends = tracker()(moved, start, end, CLOSE)
+            ends = tracker()(moved, start, end, CLOSE_PRECISION)
             moved = ends.z[:, ends.status == ACCEPTED]
         known = np.concatenate([z, moved], axis=1)
         known = known[:, distinct(known)]
@@ -54,7 +54,7 @@ def loops(
 
 def cognates(z: np.ndarray, parameters: np.ndarray) -> np.ndarray:
     """Return Roberts's two further four-bars of each (16, 2 M): with pivots a, c and b, c."""
-    found, one, two = [], z[:4], z[4:JOINTS]
+    found, one, two = [], z[:4], z[4:JOINT_UNKNOWNS]
     for (x, X, r, R), (y, Y, s, S) in ((one, two), (two, one)):
         k, K = x / (x - y), X / (X - Y)
         found.append(np.stack([-r, -R, -x, -X, k * r - r, K * R - R, k * s, K * S]))

@@ -136,7 +136,7 @@ def test_both_forms_settle_loads_that_change_their_signs():
 @pytest.mark.slow
 @pytest.mark.parametrize("factor", [0.1, 1.0, 10.0])
 def test_accelerations_hardly_depend_on_what_counts_as_settled(factor):
-    with multiplied(factor, "equations.elimination.friction_elimination.SETTLED"):
+    with multiplied(factor, "equations.elimination.friction_elimination.LOAD_CHANGE_TOL"):
         _check_accelerations()
 
 

@@ -23,7 +23,7 @@ def test_reactions_take_little_memory_besides_their_results(monkeypatch):
     """Psi_q of an output takes 1.2 kB, and the results half of that."""
     mech = udk.library.parallelogram()
     udk.reactions(mech, history(mech, 2))
-    monkeypatch.setattr(state_arrays, "PIECE", 2**18)
+    monkeypatch.setattr(state_arrays, "PIECE_BYTES", 2**18)
     states = history(mech, 3000)
     tracemalloc.start()
     found = udk.reactions(mech, states)

@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 
 import udkjax as udk
 from udkjax.integrate.compiled_mechanism import compile_mechanism
-from udkjax.native.derivatives.record import STORED
+from udkjax.native.derivatives.record import STORED_POINTS
 from udkjax.native.loaded_code import generate
 from udkjax.programs.deferred import deferred
 
@@ -127,7 +127,7 @@ def code_of(samples: int) -> list[str]:
     compiled = compile_mechanism(mechanism, udk.analyse(mechanism), udk.Auto(), udk.Projection())
     run = compiled.plan.operation
     assert run is not None
-    reverse = run.with_cotangents((True,) * run.code.number_count, STORED)
+    reverse = run.with_cotangents((True,) * run.code.number_count, STORED_POINTS)
     return [generate(operation, 1, 1).written_text for operation in (run, reverse)]
 
 

@@ -17,7 +17,7 @@ from udkjax.integrate.compiled_mechanism import compile_mechanism
 from udkjax.integrate.native_engine import mark_rows
 from udkjax.integrate.native_equations import ConcreteRates, native_equations
 from udkjax.integrate.projection import Projection
-from udkjax.native.loaded_code import FEW
+from udkjax.native.loaded_code import FEW_MEMBERS
 from udkjax.programs.deferred import deferred
 
 METHODS = [udk.Auto(), udk.Elimination(), udk.SVD(), udk.Varga(), udk.Householder(), udk.GramSchmidt(), udk.Greville()]
@@ -112,7 +112,7 @@ def test_what_is_no_number_does_not_last():
     for chosen in (*METHODS[2:], *FORMULATIONS, udk.Augmented()):
         native, _ = both(mechanism, chosen)
         expected = native.accelerations(t, q, v)
-        for members in (FEW, 5 * FEW):
+        for members in (FEW_MEMBERS, 5 * FEW_MEMBERS):
             missing = np.arange(members) < members // 2
             vs = jnp.where(missing[:, None], jnp.nan, v)
             a = np.asarray(jax.vmap(lambda v, e=native: e.accelerations(t, q, v))(vs))

@@ -101,7 +101,7 @@ def record_length(monkeypatch):
     """A function that sets the capacity of a record in points. JAX caches the shapes of traced functions."""
 
     def change(points):
-        monkeypatch.setattr(record, "STORED", points)
+        monkeypatch.setattr(record, "STORED_POINTS", points)
         jax.clear_caches()
 
     yield change
@@ -138,7 +138,7 @@ def test_a_large_batch_stores_no_records(way, monkeypatch):
     """Its members are integrated again: all bits are those of a batch with records."""
     slope, rtols = IN_A_BATCH[way], jnp.array([1e-4, 1e-6, 1e-8, 1e-10])
     expected = jax.jit(slope)(INERTIAS, rtols)
-    monkeypatch.setattr(records, "LARGEST", 0)
+    monkeypatch.setattr(records, "LARGEST_RECORDS", 0)
     jax.clear_caches()
     with calls_of(records.absent_records) as asked:
         assert_array_equal(jax.jit(slope)(INERTIAS, rtols), expected)

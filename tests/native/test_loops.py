@@ -16,7 +16,7 @@ from tests.choices import fast
 from tests.run_programs import run
 from udkjax.equations import constraints, loads
 from udkjax.equations import udwadia_kalaba as uk
-from udkjax.equations.programs.differentiable_programs import PROJECTION
+from udkjax.equations.programs.differentiable_programs import PROJECTION_OUTPUTS
 from udkjax.equations.programs.scene_arrays import constants_of
 from udkjax.equations.programs.scene_programs import scene_programs
 from udkjax.equations.programs.unrolled import Unrolled
@@ -114,7 +114,7 @@ class At:
 
     def value(self, outputs, constants, q, v, steps):
         """The results of a differentiable program; a projection takes `steps` steps."""
-        if outputs == PROJECTION:
+        if outputs == PROJECTION_OUTPUTS:
             for _ in range(steps):
                 q = self.run("q1", constants=constants, q=q)["q1"]
             return np.append(q, self.run("v1", constants=constants, q=q, v=v)["v1"])
@@ -194,7 +194,7 @@ def test_steps_with_care_take_all_rows():
     assert ranks["rank"] == np.linalg.matrix_rank(expected["psi_q"])
 
 
-DIFFERENTIABLE = [("a",), PROJECTION, ("q1",), ("v1",)]
+DIFFERENTIABLE = [("a",), PROJECTION_OUTPUTS, ("q1",), ("v1",)]
 
 
 def test_no_number_is_written_once_it_was_read():
@@ -232,7 +232,7 @@ def on_the_manifold(at):
 def test_derivatives_against_differences(at, outputs):
     code, random = at.code, np.random.default_rng(4)
     results, evaluated = [x.partition(" ")[0] for x in outputs], code.differentiable.of(*outputs)
-    q, v = on_the_manifold(at) if outputs == PROJECTION else (at.q, at.v)  # of which its derivatives are
+    q, v = on_the_manifold(at) if outputs == PROJECTION_OUTPUTS else (at.q, at.v)  # of which its derivatives are
     dconstants = random.standard_normal(len(code.constants)) * at.constants
     dconstants[:2] = 0.0
     dq, dv = random.standard_normal((2, code.coordinate_count))
@@ -264,7 +264,7 @@ def test_second_derivatives_against_differences(at, outputs):
     """This includes two directions that open the loops: a projection repeated once is right to second order."""
     code, random = at.code, np.random.default_rng(7)
     results, evaluated = [x.partition(" ")[0] for x in outputs], code.differentiable.of(*outputs)
-    q, v = on_the_manifold(at) if outputs == PROJECTION else (at.q, at.v)
+    q, v = on_the_manifold(at) if outputs == PROJECTION_OUTPUTS else (at.q, at.v)
     numbers = random.standard_normal((2, len(at.numbers))) * at.numbers
     numbers[:, -2:] = 0.0  # thresholds
     dq, dv = random.standard_normal((2, 2, code.coordinate_count))
@@ -286,9 +286,9 @@ def test_second_derivatives_against_differences(at, outputs):
     for x, given in {"numbers": numbers, "q": dq, "v": dv}.items():
         found |= dict(zip((prefix + x for prefix in PREFIXES[TWICE]), (*given.copy(), 0.0 * given[0]), strict=True))
     loops.run(LoopDerivative(code.prologue.parts, ()).second(()), found)
-    for _ in range(2 if outputs == PROJECTION else 1):
+    for _ in range(2 if outputs == PROJECTION_OUTPUTS else 1):
         loops.run(evaluated.in_mode(TWICE), found)
-        if outputs == PROJECTION:
+        if outputs == PROJECTION_OUTPUTS:
             found |= {prefix + x: found[f"{prefix}{x}1"].copy() for prefix in PREFIXES[TWICE] for x in "qv"}
     second = np.concatenate([found[f"de_{x}"] for x in results])
     assert_allclose(second, expected, atol=1e-6 * max(1.0, np.abs(expected).max()))

@@ -191,7 +191,7 @@ def test_thresholds_matter_little(factor):
         return {name: run(mechanism, tol, throw=False) for name, (mechanism, tol, _) in scenes.items()}
 
     usual = runs()
-    with multiplied(factor, "native.module.steps.PATIENCE", "native.module.steps.UNPAID"):
+    with multiplied(factor, "native.module.steps.MEASURING_PERIOD", "native.module.steps.UNPAID_STEPS"):
         other = runs()
     for name, (_, tol, is_stiff) in scenes.items():
         assert (int(usual[name].stats["implicit"]) > 0) == (int(other[name].stats["implicit"]) > 0) == is_stiff, name

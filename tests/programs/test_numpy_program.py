@@ -9,7 +9,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from tests.calls import calls_of
-from udkjax.programs.deferred import WORTH, _compiled, deferred, deferred_p
+from udkjax.programs.deferred import WORTH_COMPILING, _compiled, deferred, deferred_p
 from udkjax.programs.numpy_program import Meter, numpy_program
 
 X = np.random.default_rng(3).uniform(-2.0, 2.0, (4, 5))
@@ -226,14 +226,14 @@ def test_derivatives_and_batches_are_those_of_the_function(programs):
 @pytest.mark.skipif(deferred_p is None, reason="this JAX compiles what is called once, too")
 def test_what_is_called_often_or_takes_long_is_compiled(programs):
     few = deferred(lambda x: jnp.sin(x) + x)
-    for _ in range(WORTH):
+    for _ in range(WORTH_COMPILING):
         few(1.5 * jnp.ones(()))
     assert not programs
     for _ in range(5):
         found = few(1.5 * jnp.ones(()))
     assert len(programs) == 1
     np.testing.assert_allclose(found, np.sin(1.5) + 1.5, rtol=1e-15)
-    count = WORTH * 4
+    count = WORTH_COMPILING * 4
     long = deferred(lambda x: jax.lax.fori_loop(0, count, lambda i, s: s + 1.0, x))
     assert long(jnp.zeros(())) == count
     assert len(programs) == 2

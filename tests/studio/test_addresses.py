@@ -10,12 +10,12 @@ import pytest
 from tests.command_line import udkjax
 from udkjax.studio.addresses import SCHEME, address_of, is_address, text_of
 from udkjax.studio.limits import MOST_ADDRESS_CHARACTERS, MOST_TEXT_CHARACTERS, RefusedError
-from udkjax.studio.tasks import DRAWN, template_text
+from udkjax.studio.tasks import DRAWN_TEMPLATES, template_text
 
 TEXT = files("udkjax.studio").joinpath("drawings/six_bar.toml").read_text(encoding="utf-8")
 
 
-@pytest.mark.parametrize("text", [*map(template_text, DRAWN), TEXT + '# Öse, "µ", 連桿\n'])
+@pytest.mark.parametrize("text", [*map(template_text, DRAWN_TEMPLATES), TEXT + '# Öse, "µ", 連桿\n'])
 def test_an_address_holds_the_whole_text(text):
     address = address_of(text)
     assert text_of(address) == text and len(address) < 1_000

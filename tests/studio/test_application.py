@@ -9,7 +9,7 @@ import udkjax as udk
 from udkjax.studio.findings import pins_in_line
 from udkjax.studio.limits import RefusedError
 from udkjax.studio.shown_runs import duration_of
-from udkjax.studio.tasks import DRAWN, TEMPLATES, template_text
+from udkjax.studio.tasks import DRAWN_TEMPLATES, LIBRARY_TEMPLATES, template_text
 from udkjax.studio.worker import Worker, WorkerPool
 
 SIX_BAR = """format = 2
@@ -74,7 +74,7 @@ def test_files_and_templates_are_listed(client):
     (client.folder / "a.toml").write_text(SIX_BAR)
     found = client.ask("list").json()
     assert found["files"] == ["a.toml"]
-    assert [t["name"] for t in found["templates"]] == [*DRAWN, *TEMPLATES]
+    assert [t["name"] for t in found["templates"]] == [*DRAWN_TEMPLATES, *LIBRARY_TEMPLATES]
 
 
 def test_a_file_is_opened_changed_and_saved(client):
@@ -344,7 +344,7 @@ def test_the_end_of_a_run_is_refused_unless_it_is_a_state(client):
         assert client.ask("diagnose", text=ARMS, about="end", end=end).status_code == 400
 
 
-@pytest.mark.parametrize("name", DRAWN)
+@pytest.mark.parametrize("name", DRAWN_TEMPLATES)
 def test_a_drawn_template_moves_in_millimetres(client, name):
     opened = client.ask("open", template=name).json()
     mechanism = udk.loads(opened["text"])

@@ -7,7 +7,7 @@ import pytest
 
 import udkjax as udk
 from tests.studio.browsing import PATIENCE, studio_page
-from udkjax.studio.tasks import TEMPLATES
+from udkjax.studio.tasks import LIBRARY_TEMPLATES
 
 TOLERANCE = 1e-8  # of the page's runs
 STEPS = 600  # moves of a pulling mouse: ten seconds at 60 frames per second
@@ -170,7 +170,7 @@ def test_a_drag_released_over_a_panel_has_ended_and_escape_takes_one_away(studio
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("template", TEMPLATES)
+@pytest.mark.parametrize("template", LIBRARY_TEMPLATES)
 def test_a_pin_that_is_pulled_takes_the_mechanism_along_and_loops_stay_closed(studio, template):
     studio.js(f"studio.files.openTemplate({json.dumps(template)})")
     studio.until("studio.motion.run !== null")  # then the view shows its paths, and stays

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 import udkjax as udk
-from udkjax.studio.tasks import DRAWN, TEMPLATES, compile_drawing, diagnose_drawing, template_text
+from udkjax.studio.tasks import DRAWN_TEMPLATES, LIBRARY_TEMPLATES, compile_drawing, diagnose_drawing, template_text
 
-NAMES = (*TEMPLATES, *DRAWN)
+NAMES = (*LIBRARY_TEMPLATES, *DRAWN_TEMPLATES)
 PART = 0.3  # of the duration that the studio shows
 INSTANTS = 7
 
@@ -24,7 +24,7 @@ def all_fixes(text):
 
 
 def test_every_scene_of_the_library_is_a_template():
-    assert {*udk.library.__all__} <= {*TEMPLATES}
+    assert {*udk.library.__all__} <= {*LIBRARY_TEMPLATES}
 
 
 @pytest.mark.parametrize(

@@ -6,14 +6,14 @@ import pytest
 import udkjax as udk
 from udkjax.studio.drawn_scenes import drawing_text_of
 from udkjax.studio.shown_runs import duration_of
-from udkjax.studio.tasks import TEMPLATES, template_text
+from udkjax.studio.tasks import LIBRARY_TEMPLATES, template_text
 
 FEW = ("parallelogram", "planetary_gear", "excavator", "elliptic_trammel")
 
 
-@pytest.mark.parametrize("name", [pytest.param(n, marks=() if n in FEW else pytest.mark.slow) for n in TEMPLATES])
+@pytest.mark.parametrize("name", [pytest.param(n, marks=() if n in FEW else pytest.mark.slow) for n in LIBRARY_TEMPLATES])
 def test_a_template_moves_as_the_library_says(name):
-    mechanism = TEMPLATES[name][1]()
+    mechanism = LIBRARY_TEMPLATES[name][1]()
     drawn = udk.loads(template_text(name))
     assert drawn.drawing is not None
     ts = np.linspace(0.0, min(1.0, duration_of(drawn)), 11)

@@ -9,7 +9,7 @@ import pytest
 import udkjax
 from udkjax.studio import tasks
 from udkjax.studio.text_edits import merge_document, read_document
-from udkjax.studio.wording import PYTHON, UNKNOWN, WORDS, in_studio_words, studio_words
+from udkjax.studio.wording import PYTHON_WORDING, STUDIO_WORDS, UNKNOWN_CAUSE, in_studio_words, studio_words
 
 PACKAGE = Path(udkjax.__file__).parent
 BELOW = ("positions", "statics", "integrate", "equations/rows", "equations/states", "scene/model.py", "study/diagnosis")
@@ -57,7 +57,7 @@ def test_the_cure_is_an_act_of_the_page(case):
     assert not tasks.compile_drawing(text)["problems"]
     found = tasks.diagnose_drawing(text, about)
     said = " ".join([*found["problems"], found.get("conflict", ""), found.get("cause", "")])
-    assert words in said and not PYTHON.search(said) and "driver" not in said, said
+    assert words in said and not PYTHON_WORDING.search(said) and "driver" not in said, said
 
 
 def test_free_links_without_mass_need_one_or_a_motor():
@@ -72,7 +72,7 @@ def test_an_export_that_needs_masses_says_how_to_give_them(client):
 
 
 def test_tools_are_those_of_the_page():
-    named = {act for words in WORDS.values() for act in re.findall(r"\((\w+), (\w)\)", words)}
+    named = {act for words in STUDIO_WORDS.values() for act in re.findall(r"\((\w+), (\w)\)", words)}
     assert named == {("Motor", "M"), ("Ground", "G"), ("Select", "V")}
     for name, key in named:
         assert f'name: "{name.lower()}", key: "{key.lower()}"' in TOOLS
@@ -91,24 +91,29 @@ def messages():
 
 def test_every_pattern_is_that_of_a_message():
     known = list(messages())
-    for pattern in WORDS:
+    for pattern in STUDIO_WORDS:
         parts = re.split(r"\\.|\(.*?\)\??|\[.*?\]\*?|\.[*+]|[*+?\"]", pattern)
         words = [part.strip(" {},") for part in re.split("the others", pattern) + parts if len(part) > 8]
         assert any(part in message for message in known for part in words), pattern
 
 
 def test_no_message_of_the_package_speaks_of_python():
-    found = [message for message in messages() if PYTHON.search(message)]
+    found = [message for message in messages() if PYTHON_WORDING.search(message)]
     assert len(found) > 100
     for message in found:
         said = studio_words(message)
-        assert said and not PYTHON.search(said), (message, said)
+        assert said and not PYTHON_WORDING.search(said), (message, said)
 
 
 def test_words_of_names_stay_and_clauses_about_python_go():
     said = 'the limit of 9 steps was reached: force "drivers; the scene" jumps at 2 s: give its `breakpoints`, smooth it, or not'
     assert studio_words(said) == 'the limit of 9 steps was reached: force "drivers; the scene" jumps at 2 s'
     assert studio_words("loads (see udkjax check) of the scene; drivers (all) hold") == "loads of the drawing; motors (all) hold"
-    assert studio_words("use `Auto()`") == UNKNOWN
+    assert studio_words("use `Auto()`") == UNKNOWN_CAUSE
     answer = {"problems": ["use `Auto()`"], "sets": [{"title": "the scene"}], "text": "the scene", "n": 2}
-    assert in_studio_words(answer) == {"problems": [UNKNOWN], "sets": [{"title": "the drawing"}], "text": "the scene", "n": 2}
+    assert in_studio_words(answer) == {
+        "problems": [UNKNOWN_CAUSE],
+        "sets": [{"title": "the drawing"}],
+        "text": "the scene",
+        "n": 2,
+    }

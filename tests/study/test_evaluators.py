@@ -17,7 +17,7 @@ from udkjax.arrays import is_traced
 from udkjax.expressions.loops.compiled_loops import compiled_at_many, compiled_loops
 
 LOOPS = "expressions.loops.array_loops.WORTH_COMPILING"
-OFTEN = LOOPS, f"{LOOPS}_AT_MANY", "equations.programs.eliminated_steps.WORTH"
+OFTEN = LOOPS, f"{LOOPS}_AT_MANY", "equations.programs.eliminated_steps.USES_BEFORE_ELIMINATION"
 TURN, RISING, TIMES = np.linspace(0.0, 2 * np.pi, 25), np.linspace(1.6, 4.0, 9), np.linspace(0.0, 1.0, 11)
 ANGLES, BAUMGARTE = 1.0 + 0.2 * TIMES, udk.Baumgarte(3.0, 4.0)
 BEYOND = np.append(ANGLES, [np.pi, 3.4])  # the singular position of the parallelogram, where branches meet, and beyond it

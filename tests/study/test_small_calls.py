@@ -89,7 +89,7 @@ def test_calls_of_diagnosis_and_derivation():
     assert calls_of(lambda: udk.holding_efforts(four_bar, "body.crank.angle", ANGLES)) < 4_100
 
 
-WORTH_ELIMINATING = "equations.programs.eliminated_steps.WORTH"
+WORTH_ELIMINATING = "equations.programs.eliminated_steps.USES_BEFORE_ELIMINATION"
 
 
 @pytest.mark.parametrize("mechanism", [udk.library.four_bar, udk.library.slider_crank, lambda: LINKAGE, udk.library.peaucellier])

@@ -4,10 +4,19 @@ import numpy as np
 import pytest
 
 import udkjax as udk
-from udkjax.synthesis.curves.curve_search import FAMILY, CurveSearch
+from udkjax.synthesis.curves.curve_search import FAMILY_SIZE, CurveSearch
 from udkjax.synthesis.curves.descent import LinkageLimits
 from udkjax.synthesis.curves.dyad_forms import PINS, RAIL, SLIDE
-from udkjax.synthesis.curves.dyads import BASE, EACH, HEAD, SPAN, Topology, gradients, number_count, positions
+from udkjax.synthesis.curves.dyads import (
+    BASE_LINKS,
+    DYAD_NUMBERS,
+    HEAD_NUMBERS,
+    SPAN_INDEX,
+    Topology,
+    gradients,
+    number_count,
+    positions,
+)
 from udkjax.synthesis.curves.linkage_drawing import drawing_of, turns_on_its_branch
 from udkjax.synthesis.curves.random_linkages import random_linkages, turn_angles
 from udkjax.synthesis.curves.targets import WantedCurve, as_points, chamfer
@@ -21,11 +30,11 @@ def test_derivatives_of_linkages_are_those_of_their_positions(geared, slides):
     x, topology = random_linkages(24, 3, np.random.default_rng(0), geared, slides)
     assert set(np.unique(topology.form)) == ({PINS, RAIL, SLIDE} if slides else {PINS})
     share = np.arange(20) / 20
-    x[:, SPAN] = 5.0
+    x[:, SPAN_INDEX] = 5.0
 
     def measures(y):
-        at = positions(y, topology, y[:, SPAN, None] * share)
-        joints = np.stack([at.origins[BASE::2], at.origins[BASE + 1 :: 2], at.ends])
+        at = positions(y, topology, y[:, SPAN_INDEX, None] * share)
+        joints = np.stack([at.origins[BASE_LINKS::2], at.origins[BASE_LINKS + 1 :: 2], at.ends])
         third = np.sum(at.cosines**2, 0) + np.sum(np.abs(joints) ** 2, (0, 1))
         return at, joints, np.stack([np.real(at.pin), np.imag(at.pin), third], 1)
 
@@ -51,10 +60,10 @@ def test_random_linkages_close_over_the_whole_turn_with_their_dimensions(geared,
     at, rows = positions(x, topology, turn_angles(len(x)), least=0.0), np.arange(len(x))
     assert len(x) > 50
     for d in range(3):
-        numbers = x[:, HEAD + EACH * d : HEAD + EACH * (d + 1), None]
-        own, other, B, R = at.turns[BASE + 2 * d], at.turns[BASE + 2 * d + 1], topology.second[:, d], at.ends[d]
+        numbers = x[:, HEAD_NUMBERS + DYAD_NUMBERS * d : HEAD_NUMBERS + DYAD_NUMBERS * (d + 1), None]
+        own, other, B, R = at.turns[BASE_LINKS + 2 * d], at.turns[BASE_LINKS + 2 * d + 1], topology.second[:, d], at.ends[d]
         Q = at.origins[B, rows] + at.turns[B, rows] * (numbers[:, 2] + 1j * numbers[:, 3])
-        on_first, on_second = np.conj(own) * (R - at.origins[BASE + 2 * d]), np.conj(other) * (R - Q)
+        on_first, on_second = np.conj(own) * (R - at.origins[BASE_LINKS + 2 * d]), np.conj(other) * (R - Q)
         pins, rails, sliding = (topology.form[:, d] == form for form in (PINS, RAIL, SLIDE))
         for which, found, expected in (
             (~sliding, on_first, numbers[:, 4]),
@@ -70,10 +79,10 @@ def test_random_linkages_close_over_the_whole_turn_with_their_dimensions(geared,
 
 def test_a_four_bar_has_the_positions_of_the_drawing():
     x = np.zeros((1, number_count(1)))
-    x[0, HEAD : HEAD + EACH], x[0, -2:] = [1.0, 0.0, 3.0, 0.0, 2.5, 2.0], [1.0, 0.5]
+    x[0, HEAD_NUMBERS : HEAD_NUMBERS + DYAD_NUMBERS], x[0, -2:] = [1.0, 0.0, 3.0, 0.0, 2.5, 2.0], [1.0, 0.5]
     topology = Topology(np.array([[1]]), np.array([[0]]), np.array([[1.0]]), np.array([[PINS]]), np.array([0]))
     at = positions(x, topology, np.array([[0.0, 1.0]]))
-    P, R, Q = at.origins[BASE, 0], at.ends[0, 0], at.origins[BASE + 1, 0]
+    P, R, Q = at.origins[BASE_LINKS, 0], at.ends[0, 0], at.origins[BASE_LINKS + 1, 0]
     np.testing.assert_allclose(np.abs(R - P), 2.5, rtol=1e-12)
     np.testing.assert_allclose(np.abs(R - Q), 2.0, rtol=1e-12)
     np.testing.assert_allclose(P, np.exp(1j * np.array([0.0, 1.0])), rtol=1e-12)
@@ -219,7 +228,7 @@ def test_a_search_ends_in_the_middle_of_a_stage_and_keeps_what_it_has():
     next(search.stages())
     search.until = 0.0
     search._grow(search.fresh, 4, np.random.default_rng(0))
-    assert np.isfinite(search.fresh[6].loss).all() and len(search.fresh[6].loss) > FAMILY
+    assert np.isfinite(search.fresh[6].loss).all() and len(search.fresh[6].loss) > FAMILY_SIZE
     search.finish()
     rough = search.best
     assert rough < 0.1 and not search.finished  # to be finished again

@@ -11,7 +11,7 @@ from importlib import import_module
 from importlib.metadata import version
 
 from udkjax.cli.exits import exit_codes
-from udkjax.extras import STUDIO, require
+from udkjax.extras import STUDIO_PACKAGES, require
 
 COMMANDS = {  # in the order of the help, each with its folder
     "report": "studies",
@@ -52,7 +52,7 @@ def main(arguments: list[str] | None = None) -> None:
         return
     store_compiled_programs()
     with exit_codes():
-        require("tyro", *(STUDIO if words[:1] == ["studio"] else ()))
+        require("tyro", *(STUDIO_PACKAGES if words[:1] == ["studio"] else ()))
         from udkjax.cli.common import parse_and_run
 
         parse_and_run({name: command(name) for name in COMMANDS}, arguments)

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from udkjax.cli.common import load, refuse
-from udkjax.extras import NETCDF, OptionalImport, require
+from udkjax.extras import NETCDF_PACKAGES, OptionalImport, require
 
 if TYPE_CHECKING:
     import numpy as np
@@ -36,7 +36,7 @@ def load_to_write(scene: Path, out: Path | None, plot: Path | None = None) -> tu
     """Return a scene and its text; exit with a message if the output files `out` and `plot` cannot be written."""
     check_target(out)
     check_target(plot, PICTURE_SUFFIXES, "--plot")
-    require(*(NETCDF if out else ()), *(["matplotlib"] if plot else ()))
+    require(*(NETCDF_PACKAGES if out else ()), *(["matplotlib"] if plot else ()))
     return load(scene)
 
 

@@ -19,11 +19,11 @@ from jaxtyping import Bool, Float
 from udkjax.transforms.gradients import stop_gradients
 
 # Tolerance on y >= 0, relative to max |b|, for rows of unit size. Rounding errors are some 1e-15, more for nearly dependent rows.
-TIGHT = 1e-12
+FEASIBILITY_TOL = 1e-12
 LEMKE_STEPS = 10  # for each row; Lemke's method takes about as many steps as rows
 # Bound on the variable x0, relative to max |q|, where Lemke's method ends on a ray: in degenerate problems, a smaller one is a
 # rounding error, and the problem is solved.
-ON_RAY = 1e-9
+RAY_TOL = 1e-9
 STEPS_PER_ROW = 6  # one step per positive x is usual; the limit stops cycles caused by rounding
 
 
@@ -140,14 +140,14 @@ def _lemke(M: Float[Any, "n n"], q: Float[Any, "n"], xp: ModuleType) -> tuple[Bo
 
     def step(state: _Tableau) -> _Tableau:
         column = state.table[:, state.enters]
-        candidates = column > TIGHT * xp.max(xp.abs(column))
+        candidates = column > FEASIBILITY_TOL * xp.max(xp.abs(column))
         fails = ~xp.any(candidates)
         divisor = xp.where(candidates, column, 1.0)
         # The smallest ratio; of equal ones that of x0, else the first in lexicographic order, which excludes cycles.
         for values in (state.table[:, -1], xp.where(state.basic == 2 * n, -1.0, 0.0) * divisor, *state.table[:, :n].T):
             ratio = xp.where(candidates, values / divisor, xp.inf)
             least = xp.min(ratio)
-            candidates = candidates & (ratio <= least + TIGHT * xp.maximum(1.0, xp.abs(least)))
+            candidates = candidates & (ratio <= least + FEASIBILITY_TOL * xp.maximum(1.0, xp.abs(least)))
         failed = state._replace(fails=fails)
         if xp is np:
             return failed if fails else pivot(state, np.argmax(candidates))
@@ -159,7 +159,8 @@ def _lemke(M: Float[Any, "n n"], q: Float[Any, "n"], xp: ModuleType) -> tuple[Bo
     right = q / xp.maximum(xp.max(xp.abs(q)), np.finfo(float).tiny)
     table = xp.concatenate([np.eye(n) + 0 * M, -M, xp.zeros_like(q)[:, None] - 1, right[:, None]], axis=1)
     state = _Tableau(table, np.arange(n) + 0, xp.asarray(2 * n), xp.asarray(0), xp.all(right >= 0), xp.asarray(False))
-    leads = n - 1 - xp.argmax((right <= xp.min(right) + TIGHT)[::-1])  # the last of equal rows: first in lexicographic order
+    # The last of equal rows is the first in lexicographic order.
+    leads = n - 1 - xp.argmax((right <= xp.min(right) + FEASIBILITY_TOL)[::-1])
     if xp is np:
         if not state.done:
             state = pivot(state, leads)
@@ -172,7 +173,7 @@ def _lemke(M: Float[Any, "n n"], q: Float[Any, "n"], xp: ModuleType) -> tuple[Bo
         state = jax.lax.while_loop(goes_on, step, state)
     passive = xp.any(state.basic[:, None] == n + np.arange(n), axis=0)
     x0 = xp.sum(xp.where(state.basic == 2 * n, state.table[:, -1], 0.0))
-    solved = state.done | (state.fails & (x0 <= ON_RAY))
+    solved = state.done | (state.fails & (x0 <= RAY_TOL))
     return passive & solved, solved
 
 
@@ -237,7 +238,7 @@ def solve(A: Float[Any, "*m n n"], b: Float[Any, "*m n"], xp: ModuleType) -> Flo
 def _passive_set(W: Any, b: Any, allowed: Any, floor: Any, equalities: Any, xp: ModuleType) -> Any:
     rows = allowed | equalities
     largest_b = xp.max(xp.where(rows, xp.abs(b), 0.0), axis=-1, keepdims=True)
-    floor = xp.maximum(floor, TIGHT * largest_b)
+    floor = xp.maximum(floor, FEASIBILITY_TOL * largest_b)
     if b.shape[-1] == 1 or (xp is np and not equalities.any() and allowed.sum(-1).max(initial=0) <= 1):
         return equalities | (allowed & (b + floor < 0))
 
@@ -250,7 +251,8 @@ def _passive_set(W: Any, b: Any, allowed: Any, floor: Any, equalities: Any, xp: 
         # Raise this x, and move all positive ones so that their y stay zero, until its y is zero or one of them is.
         way = xp.where(driving, 1.0, _solve_passive(W, times(W, driving * 1.0), state.passive, xp))
         slope, rest = (xp.sum(xp.where(driving, x, 0.0), -1, keepdims=True) for x in (times(W, way), -y))
-        full = xp.where(slope > TIGHT, rest / xp.where(slope > TIGHT, slope, 1.0), xp.inf)  # a dependent row's y stays
+        is_rising = slope > FEASIBILITY_TOL  # y of a dependent row does not change
+        full = xp.where(is_rising, rest / xp.where(is_rising, slope, 1.0), xp.inf)
         falls = state.passive & ~equalities & (way < 0)
         fraction = xp.where(falls, xp.maximum(state.x, 0.0) / xp.where(falls, -way, 1.0), xp.inf)
         smallest = xp.min(fraction, axis=-1, keepdims=True)

@@ -14,9 +14,9 @@ from jaxtyping import Array, Bool, Float
 
 # A row blocks a direction if G x grows along it by more than this, relative to the terms of the sum, which may cancel: near the
 # angle at which friction locks a mechanism, half of the digits are left of the difference.
-BLOCKS = 1e-9
+BLOCKING_TOL = 1e-9
 # Part of c that no active row holds, relative to c: less is rounding, after a refinement some 1e-15 times the condition.
-HELD = 1e-11
+OPTIMALITY_TOL = 1e-11
 STEPS_PER_ROW = 10  # one or two are usual; beyond half of them Bland's rule excludes cycles
 
 
@@ -61,11 +61,11 @@ def maximize(c: Float[Array, "n"], G: Float[Array, "rows n"], h: Float[Array, "r
         y = y + jnp.linalg.solve(gram, held @ (slope - held.T @ y))
         ahead = slope - held.T @ y
         late = state.steps > most // 2
-        is_held = (jnp.linalg.norm(ahead) <= HELD) | (state.active.sum() >= G.shape[1])
-        negative = state.active & (y < -HELD)
+        is_held = (jnp.linalg.norm(ahead) <= OPTIMALITY_TOL) | (state.active.sum() >= G.shape[1])
+        negative = state.active & (y < -OPTIMALITY_TOL)
         drops = _first(jnp.where(negative, jnp.where(late, -1.0, y), jnp.inf))
         rates = rows @ ahead
-        blocks = ~state.active & (rates > BLOCKS * (sizes @ jnp.abs(ahead)))
+        blocks = ~state.active & (rates > BLOCKING_TOL * (sizes @ jnp.abs(ahead)))
         ways = jnp.where(blocks, jnp.maximum(right - rows @ state.x, 0.0) / jnp.where(blocks, rates, 1.0), jnp.inf)
         way = jnp.min(ways)
         nearest = blocks & (ways <= way)

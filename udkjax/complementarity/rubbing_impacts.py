@@ -47,7 +47,7 @@ from udkjax.transforms.gradients import stop_gradients
 # contact may stick instead of sliding at 1e-6 of its speed.
 COMPLIANCE = 1e-6
 # Parts of a phase for each row: each contact stops sliding once or twice. The last part is one problem.
-PARTS = 2
+PHASE_PARTS_PER_ROW = 2
 ROUNDING = 1e-12  # error of y = W x + b, relative to the largest x
 
 
@@ -141,7 +141,7 @@ def _impact(contacts: RubbingContacts, of_rows: Any, xp: ModuleType) -> Any:
 
 
 def _most_parts(law: _ImpactLaw) -> int:
-    return PARTS * (len(law.takes_part) + len(law.of_rows))
+    return PHASE_PARTS_PER_ROW * (len(law.takes_part) + len(law.of_rows))
 
 
 def _at_rest(law: _ImpactLaw, state: _Progress) -> _Progress:

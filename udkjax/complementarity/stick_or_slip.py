@@ -38,7 +38,7 @@ from udkjax.complementarity.linear import eliminate
 
 # Iterations for the limits, sweeps of a projected Gauss-Seidel method in each, and the change of forces, as shares of their
 # limits, at which sweeps end. They decide with which modes pivots begin, and so only the number of pivots.
-REPETITIONS, SWEEPS, SAME_SHARE = 10, 20, 1e-6
+LIMIT_ITERATIONS, SWEEPS, SHARE_TOL = 10, 20, 1e-6
 # Pivots per joint: at first of all joints that violate their law, then only of the first such joint, which does not cycle.
 BLOCK_STEPS, SINGLE_STEPS = 2, 8
 
@@ -350,7 +350,7 @@ class JointsAtRest(NamedTuple):
             if xp is np:
                 for k in range(SWEEPS):
                     before, state = state[0], sweep(k, state)
-                    if (abs(state[0] - before) <= SAME_SHARE * limit).all():
+                    if (abs(state[0] - before) <= SHARE_TOL * limit).all():
                         break
             else:
                 state = jax.lax.fori_loop(0, SWEEPS, sweep, state)
@@ -363,13 +363,13 @@ class JointsAtRest(NamedTuple):
 
         share = xp.where(self.rest, direction, 0.0)
         if xp is np:
-            for k in range(REPETITIONS):
+            for k in range(LIMIT_ITERATIONS):
                 before, share = share, improve(share)
                 # Pivots settle the rest once the iteration has found the joints at their limits, twice the same.
                 if k and np.array_equal(at_limit(share), at_limit(before)):
                     break
         else:
-            share = jax.lax.fori_loop(0, REPETITIONS, lambda _, x: improve(x), share)
+            share = jax.lax.fori_loop(0, LIMIT_ITERATIONS, lambda _, x: improve(x), share)
         return at_limit(share)
 
     def _modes(self, pivot: _Pivot, xp: ModuleType) -> FrictionModes:

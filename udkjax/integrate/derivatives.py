@@ -25,8 +25,8 @@ from udkjax.transforms.linear_map import DifferentiableFunction, Linear, change_
 from udkjax.transforms.split_jvp import split_jvp
 from udkjax.transforms.traced_numbers import Mask, TreeOfNumbers, replaced, select, split_numbers
 
-CONTROL = ("rtol", "atol", "smallest", "h")  # of `Problem`: the numbers of the step controller
-SMOOTH = tuple(IntegratorOutput._fields.index(name) for name in ("q", "v", "y"))  # indices of fields with derivatives
+CONTROLLER_NUMBERS = ("rtol", "atol", "smallest", "h")  # of `Problem`: the numbers of the step controller
+SMOOTH_FIELDS = tuple(IntegratorOutput._fields.index(name) for name in ("q", "v", "y"))  # indices of fields with derivatives
 
 
 def differentiable(problem: Problem, has_fixed_times: bool = False) -> IntegratorOutput:
@@ -38,7 +38,7 @@ def differentiable(problem: Problem, has_fixed_times: bool = False) -> Integrato
         problem: the problem.
         has_fixed_times: whether `problem.ts`, although traced, needs no derivatives: it was concrete when `simulate` was called.
     """
-    control = {name: stop_gradients(getattr(problem, name)) for name in CONTROL}
+    control = {name: stop_gradients(getattr(problem, name)) for name in CONTROLLER_NUMBERS}
     problem = replace(problem, **control)
     has_varying_times = isinstance(problem.ts, Tracer) and not has_fixed_times
     return run_of_times(_integrate, problem) if has_varying_times else _integrate(problem)
@@ -65,18 +65,18 @@ def _(primals, tangents):
         """Return the run, and its change along the direction as a linear map, which JAX can transpose for reverse mode."""
         raw, recorded = at[0].recorded(stop_gradients(at[1]), active)
         linear = Linear(function=at[0], inputs=at[1], run=recorded, active=active)
-        return list(_as_run(*at, raw)), defined_along(linear.applied, direction, [raw[k] for k in SMOOTH])
+        return list(_as_run(*at, raw)), defined_along(linear.applied, direction, [raw[k] for k in SMOOTH_FIELDS])
 
     def at_once(at: Any, direction: list[Array]) -> tuple[list[Any], list[Any]]:
         """Return the run, and its change along the direction, both computed in one run of forward mode."""
         function, inputs = at
         raw, change = function.run_and_jvp(inputs, active, direction)
-        return list(raw), [jnp.where(jnp.isnan(raw[k]), jnp.nan, dx) for k, dx in zip(SMOOTH, change, strict=True)]
+        return list(raw), [jnp.where(jnp.isnan(raw[k]), jnp.nan, dx) for k, dx in zip(SMOOTH_FIELDS, change, strict=True)]
 
-    known = list(shapes), [shapes[k] for k in SMOOTH]
+    known = list(shapes), [shapes[k] for k in SMOOTH_FIELDS]
     raw, change = split_jvp(in_parts, at_once, primals, select(tangents[1], active), known)
     return IntegratorOutput(*raw), IntegratorOutput._make(
-        change[SMOOTH.index(k)] if k in SMOOTH else None for k in range(len(raw))
+        change[SMOOTH_FIELDS.index(k)] if k in SMOOTH_FIELDS else None for k in range(len(raw))
     )
 
 
@@ -132,7 +132,7 @@ class DifferentiableRun(DifferentiableFunction):
 
         def function(active_inputs: list[Array]) -> list[Array]:
             raw = integrate_by_diffrax(self.problem(replaced(inputs, active, active_inputs)), "RecursiveCheckpointAdjoint")
-            return [raw[k] for k in SMOOTH]
+            return [raw[k] for k in SMOOTH_FIELDS]
 
         return jax.vjp(function, select(inputs, active))[1](cotangents)[0]
 
@@ -168,7 +168,7 @@ class DifferentiableRun(DifferentiableFunction):
             raw, changes = native_engine.jvp(self.problem(inputs), self.problem.marks(active), change)
             return self._own(inputs, raw), list(changes)
         raw, change = change_along(lambda inputs: integrate_by_diffrax(self.problem(inputs)), inputs, active, tangents)
-        return raw, [change[k] for k in SMOOTH]
+        return raw, [change[k] for k in SMOOTH_FIELDS]
 
     def recorded(self, inputs: list[Array], active: Mask) -> tuple[IntegratorOutput, "native_engine.RecordedRun | tuple[()]"]:
         """Return the run, and its record for reverse mode by machine code; the record is () if diffrax integrates.
@@ -191,7 +191,7 @@ class DifferentiableRun(DifferentiableFunction):
 
     def __call__(self, inputs: list[Array]) -> list[Array]:
         raw = integrate_by_diffrax(self.problem(inputs))
-        return [raw[k] for k in SMOOTH]
+        return [raw[k] for k in SMOOTH_FIELDS]
 
     def shapes(self, inputs: list[Array]) -> list[tuple[int, ...]]:
         problem = self.problem(inputs)

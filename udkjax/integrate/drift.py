@@ -20,9 +20,10 @@ from udkjax.pinv import SVD
 from udkjax.pinv.auto import NEAR_SHARE, NEAREST
 from udkjax.transforms.gradients import stop_gradients
 
-DEPENDENT = np.finfo(float).eps ** 0.5  # distance at or below which rows are dependent: eigenvalues are its square, with rounding
+# Distance at or below which rows are dependent: eigenvalues are its square, with rounding.
+DEPENDENT_DISTANCE = np.finfo(float).eps ** 0.5
 
-ASIDE = CLOSURE.aside
+STEP_ASIDE = CLOSURE.aside
 
 
 def distance(equations: AbstractSystem, t: Float[ArrayLike, ""], y: Float[Array, "2n"]) -> Float[Array, ""]:
@@ -35,7 +36,7 @@ def distance(equations: AbstractSystem, t: Float[ArrayLike, ""], y: Float[Array,
     length = jnp.sqrt(jnp.diagonal(gram))
     unit = jnp.where(length > 0, 1 / jnp.where(length > 0, length, 1.0), 0.0)
     squares = jnp.linalg.eigvalsh(gram * unit[:, None] * unit)
-    return jnp.sqrt(jnp.min(jnp.where(squares > DEPENDENT**2 * len(A), squares, 1.0), initial=1.0))
+    return jnp.sqrt(jnp.min(jnp.where(squares > DEPENDENT_DISTANCE**2 * len(A), squares, 1.0), initial=1.0))
 
 
 def most_rank(problem: Problem, equations: TextbookEquations) -> Float[Array, ""]:
@@ -55,14 +56,17 @@ def _rank_near_start(problem: Problem, equations: TextbookEquations) -> Float[Ar
     scales, t, q, v = equations.scales, problem.ts[0], problem.q, problem.v
     by_rank = replace(equations, method=SVD(equations.rank_tol))
     random = np.random.default_rng(0).uniform(-1.0, 1.0, len(q)) * scales.coordinates(len(q))
-    along = jnp.where(scales.size(v) > ASIDE.free * problem.rate, v, random)
+    along = jnp.where(scales.size(v) > STEP_ASIDE.free * problem.rate, v, random)
     step = by_rank.tangent_part(t, q, v, along, jnp.zeros_like(v)).dq
     size = scales.size(step)
-    is_free = size > ASIDE.free * scales.size(along)
-    t, moved = t + ASIDE.length / problem.rate, q + jnp.where(is_free, ASIDE.length / jnp.where(is_free, size, 1.0), 0.0) * step
-    moved = jax.lax.fori_loop(0, ASIDE.corrections, lambda _, x: by_rank.correct(t, x, jnp.zeros_like(x))[0], moved)
+    is_free = size > STEP_ASIDE.free * scales.size(along)
+    t, moved = (
+        t + STEP_ASIDE.length / problem.rate,
+        q + jnp.where(is_free, STEP_ASIDE.length / jnp.where(is_free, size, 1.0), 0.0) * step,
+    )
+    moved = jax.lax.fori_loop(0, STEP_ASIDE.corrections, lambda _, x: by_rank.correct(t, x, jnp.zeros_like(x))[0], moved)
     is_closed = scales.violation(by_rank.violation(t, moved, v)[0]) < CLOSURE.tol
-    is_found = is_closed & (~is_free | (scales.size(moved - q) > ASIDE.stays * ASIDE.length))
+    is_found = is_closed & (~is_free | (scales.size(moved - q) > STEP_ASIDE.stays * STEP_ASIDE.length))
     rank = jnp.maximum(by_rank.rank(problem.ts[0], q), by_rank.rank(t, moved))
     return jnp.where(is_found, rank, len(scales.rows)).astype(float)
 

@@ -97,7 +97,7 @@ CAUSES = {
 }
 
 
-_ORDER = (
+_COUNT_ORDER = (
     "steps rejected implicit right_hand_sides projections events kinks"  # order of counts in texts, since jit sorts the names
 )
 
@@ -270,7 +270,7 @@ def format_work(stats: Mapping[str, ArrayLike]) -> str:
     counts = {name: int(np.asarray(count)) for name, count in stats.items() if name != "accepted"}
     if not counts.get("implicit", 1):
         del counts["implicit"]
-    return ", ".join(f"{counts[name]:,} {words[name]}" for name in sorted(counts, key=_ORDER.find) if counts[name] >= 0)
+    return ", ".join(f"{counts[name]:,} {words[name]}" for name in sorted(counts, key=_COUNT_ORDER.find) if counts[name] >= 0)
 
 
 def scene_text(mechanism: Any) -> str:

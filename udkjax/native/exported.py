@@ -9,14 +9,14 @@ from typing import Any
 import jax
 import jax.export
 
-from udkjax.extras import EXPORT, require
+from udkjax.extras import EXPORT_PACKAGES, require
 from udkjax.native.host.host_function import needed_by
 from udkjax.native.module import loading
 from udkjax.requirements import ArgumentError
 
-CALL = re.compile(r"custom_call @([\w.]+)")
-OWN = "udkjax_"  # prefix of the names of machine code
-FORMAT = b"udkjax exported 1\n"
+CUSTOM_CALL = re.compile(r"custom_call @([\w.]+)")
+OWN_PREFIX = "udkjax_"  # prefix of the names of machine code
+FORMAT_HEADER = b"udkjax exported 1\n"
 
 
 def export_compiled(function: Callable[..., Any], *arguments: Any) -> bytes:
@@ -36,10 +36,10 @@ def export_compiled(function: Callable[..., Any], *arguments: Any) -> bytes:
         MissingExtraError: the extra `export` is not installed.
         ArgumentError: the function calls Python, as do runs by diffrax, runs with events, and forces that JAX cannot trace.
     """
-    require(*EXPORT)
+    require(*EXPORT_PACKAGES)
     jitted: Any = function if hasattr(function, "lower") else jax.jit(function)
-    names = sorted({*CALL.findall(jitted.lower(*arguments).as_text())})
-    own = {name: loading.registered(name) for name in names if name.startswith(OWN)}
+    names = sorted({*CUSTOM_CALL.findall(jitted.lower(*arguments).as_text())})
+    own = {name: loading.registered(name) for name in names if name.startswith(OWN_PREFIX)}
     lost = [name for name, code in own.items() if code is None]
     foreign = [name for name in names if "callback" in name or "host" in name]
     if lost or foreign:
@@ -50,7 +50,7 @@ def export_compiled(function: Callable[..., Any], *arguments: Any) -> bytes:
     artifact = jax.export.export(jitted, platforms=("cpu",), disabled_checks=checks)(*arguments)
     texts = json.dumps({name: code.texts() for name, code in own.items() if code is not None})
     packed = zlib.compress(texts.encode())
-    return FORMAT + len(packed).to_bytes(8, "little") + packed + bytes(artifact.serialize())
+    return FORMAT_HEADER + len(packed).to_bytes(8, "little") + packed + bytes(artifact.serialize())
 
 
 def load_exported(data: bytes) -> Callable[..., Any]:
@@ -68,11 +68,11 @@ def load_exported(data: bytes) -> Callable[..., Any]:
     Raises:
         ArgumentError: the bytes are not those of an exported function.
     """
-    require(*EXPORT)
-    if not data.startswith(FORMAT):
+    require(*EXPORT_PACKAGES)
+    if not data.startswith(FORMAT_HEADER):
         raise ArgumentError("data must be the bytes that udkjax.export_compiled returned")
-    start = len(FORMAT) + 8
-    end = start + int.from_bytes(data[len(FORMAT) : start], "little")
+    start = len(FORMAT_HEADER) + 8
+    end = start + int.from_bytes(data[len(FORMAT_HEADER) : start], "little")
     for name, texts in json.loads(zlib.decompress(data[start:end])).items():
         loading.load_as(name, texts)
     return jax.export.deserialize(bytearray(data[end:])).call

@@ -18,7 +18,7 @@ from udkjax.native.code import interrupts, machine, processor
 from udkjax.native.gpu import host_handler
 from udkjax.native.host.ffi import handler
 from udkjax.native.language.text import text_of_module
-from udkjax.native.module.layout import INFO, INPUTS, OUTPUTS
+from udkjax.native.module.layout import INFO_NAMES, INPUTS, OUTPUTS
 from udkjax.native.module.loading import Code, load
 from udkjax.native.module.memory import Memory
 from udkjax.native.module.steps import Status
@@ -32,8 +32,8 @@ CODE_BYTES = 1.4  # memory of loaded code, with the programs of its scene, for e
 QUICK_MEMBERS = 16  # maximum number of members of a call by quickly compiled code
 QUICK_STEPS = 4_000  # maximum number of steps of all its members, 20 ms
 QUICK_SECONDS_OF_LINE = 2e-6  # total time of such calls per line of text: a tenth of its compile time
-TIMES, BREAKS = INPUTS.index("ts"), INPUTS.index("breaks")
-FEW = 2  # maximum number of members that run one after another: eight lanes take as long as two members
+TIMES_INPUT, BREAKS_INPUT = INPUTS.index("ts"), INPUTS.index("breaks")
+FEW_MEMBERS = 2  # maximum number of members that run one after another: eight lanes take as long as two members
 
 
 @lru_cache(maxsize=1)  # a module takes ten times as much memory as its code
@@ -118,7 +118,7 @@ class LoadedCode:
     @property
     def name(self) -> str:
         """The name of the optimized code as an FFI target of XLA in programs of the CPU; the first access registers the code."""
-        return (self._later or self).code(machine.LEVEL).name
+        return (self._later or self).code(machine.OPTIMIZATION_LEVEL).name
 
     @property
     def name_on_card(self) -> str:
@@ -133,16 +133,16 @@ class LoadedCode:
 
     def code(self, level: int) -> Code:
         """Return the code at a level of optimization, `machine.LEVEL` or `machine.QUICK`; its first use compiles it."""
-        return self._optimized if level == machine.LEVEL else self._quick
+        return self._optimized if level == machine.OPTIMIZATION_LEVEL else self._quick
 
     @cached_property
     def _optimized(self) -> Code:
         self._seconds = 0.0
-        return self._load(machine.LEVEL)
+        return self._load(machine.OPTIMIZATION_LEVEL)
 
     @cached_property
     def _quick(self) -> Code:
-        return self._load(machine.QUICK)
+        return self._load(machine.QUICK_LEVEL)
 
     def __call__(self, inputs: Sequence[np.ndarray], shapes: Sequence[tuple[int, ...]]) -> list[np.ndarray]:
         """Return the outputs for these inputs, arrays of the given shapes.
@@ -179,7 +179,7 @@ class LoadedCode:
         self._seconds -= time.perf_counter() - start
         if column is not None:
             info = outputs[OUTPUTS.index("info")]
-            if info.size and np.any(is_limited & (info[:, INFO.index("code")] == Status.STEP_LIMIT)):
+            if info.size and np.any(is_limited & (info[:, INFO_NAMES.index("code")] == Status.STEP_LIMIT)):
                 self._seconds = 0.0
                 return None
         return outputs
@@ -191,7 +191,7 @@ class LoadedCode:
         """
         code, inputs = code or self._optimized, [np.ascontiguousarray(x, np.float64) for x in inputs]
         outputs = [np.full(shape, np.nan) for shape in shapes]
-        members, times, knots = shapes[0][0], inputs[TIMES].shape[1], inputs[BREAKS].shape[1]
+        members, times, knots = shapes[0][0], inputs[TIMES_INPUT].shape[1], inputs[BREAKS_INPUT].shape[1]
         arrays, following = (*inputs, *outputs), (ctypes.c_int64 * 2)()
         record = (  # the fields in the order of `Memory.call_fields`
             *(members, times, knots, inputs[-1].shape[self._directions_in]),
@@ -234,7 +234,7 @@ def call_concrete(operation: Operation, inputs: Sequence[np.ndarray], times: int
 
 def select_code(inputs: Sequence[Any], operation: Operation) -> LoadedCode:
     """Return the code that suits the members and directions of these inputs: few members run one after another, more in lanes."""
-    one_by_one = not operation.in_lanes or max(x.shape[0] for x in inputs) <= FEW
+    one_by_one = not operation.in_lanes or max(x.shape[0] for x in inputs) <= FEW_MEMBERS
     directions = inputs[-1].shape[1] if operation.tangents and one_by_one and operation.code.is_small else 1
     tangent_lanes = min(2 ** math.ceil(math.log2(directions)), processor.lanes())  # shorter registers are faster
     return machine_code(operation, 1 if one_by_one else processor.lanes(), tangent_lanes)

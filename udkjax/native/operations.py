@@ -19,7 +19,7 @@ from jaxtyping import ArrayLike
 
 from udkjax.equations.programs.run_programs import RunPrograms
 from udkjax.equations.terms.structure import numbers_as_vector
-from udkjax.native.module.layout import INPUTS, OUTPUTS, SETTINGS, SHARE
+from udkjax.native.module.layout import INPUTS, MEMBERS_PER_THREAD, OUTPUTS, SETTINGS
 from udkjax.native.module.memory import Memory
 from udkjax.native.module.module import Module
 from udkjax.native.parts.formulations import FormulationCode
@@ -48,7 +48,7 @@ class Operation(ABC):
     settings: ClassVar[tuple[str, ...]] = SETTINGS  # names of the settings of this kind of operation
     in_lanes: ClassVar[bool] = True  # whether members run in lanes
     results: ClassVar[int] = len(OUTPUTS)  # number of outputs without directions, which come first
-    share: ClassVar[int] = SHARE  # minimum number of members of a thread
+    share: ClassVar[int] = MEMBERS_PER_THREAD  # minimum number of members of a thread
 
     @property
     def all_settings(self) -> tuple[str, ...]:
@@ -132,7 +132,7 @@ class StateOperation(Operation):
     formulation: FormulationCode | None = None  # None: the Udwadia-Kalaba equation
 
     settings: ClassVar[tuple[str, ...]] = StateFunction.settings
-    share: ClassVar[int] = 32 * SHARE  # a state takes a microsecond
+    share: ClassVar[int] = 32 * MEMBERS_PER_THREAD  # a state takes a microsecond
     function: ClassVar[type[StateFunction]]
 
     @property
@@ -248,7 +248,7 @@ class FindScales(Operation):
     settings: ClassVar[tuple[str, ...]] = ()
     in_lanes: ClassVar[bool] = False
     results: ClassVar[int] = len(ScaleCode.results)
-    share: ClassVar[int] = 32 * SHARE  # a member takes a microsecond
+    share: ClassVar[int] = 32 * MEMBERS_PER_THREAD  # a member takes a microsecond
 
     def module(self, width: int, tangent_lanes: int, vector: int) -> Memory:
         return ScaleCode(self.code)

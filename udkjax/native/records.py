@@ -17,7 +17,7 @@ from udkjax.native.runs import RunCotangents, goes_back
 
 # The largest records of a batch (bytes). To write and read more memory takes longer than to integrate again: for 1,000 runs
 # of the paper's linkage 1.9 times as long over 1 s, with 20 steps, and 0.9 times as long over 20 s, with a hundred.
-LARGEST = 2**25
+LARGEST_RECORDS = 2**25
 LARGEST_ON_CARD = 64  # members: the same for records that are copied to a graphics card and back
 GIVEN_RECORD, GIVEN_STEPS = 5, 6  # places of the record and of the number of steps among the inputs, from the last
 
@@ -30,7 +30,7 @@ def are_stored(inputs: Sequence[Any], operation: Operation, members: int, on_car
         return True
     if on_card:
         return members < LARGEST_ON_CARD
-    return 8 * members * operation.record_length <= LARGEST
+    return 8 * members * operation.record_length <= LARGEST_RECORDS
 
 
 def without_records(inputs: Sequence[Any], operation: Any) -> tuple[list[Any], Any]:

@@ -9,7 +9,7 @@ from udkjax.native.derivatives.backpropagation import Reverse
 from udkjax.native.derivatives.second_tangents import ForwardTwice
 from udkjax.native.derivatives.state_tangents import StateTangents
 from udkjax.native.derivatives.tangents import Forward
-from udkjax.native.module.layout import INFO, INPUTS, Plan
+from udkjax.native.module.layout import INFO_NAMES, INPUTS, Plan
 from udkjax.native.module.module import Module
 from udkjax.native.module.tableau import EULER, KVAERNO5, Method
 from udkjax.native.operations import Accelerate, Operation
@@ -26,7 +26,8 @@ from udkjax.native.watching.watching import Watching
 class RunStates(Operation):
     """The operation that integrates.
 
-    Its outputs are q, v and the violation of Psi at each output time, and numbers that describe the end of the run (`INFO`).
+    Its outputs are q, v and the violation of Psi at each output time, and the numbers `INFO_NAMES` that describe the end of the
+    run.
     """
 
     method: Method
@@ -39,7 +40,7 @@ class RunStates(Operation):
     leaves: bool = False  # whether it does so by the module of `later`
     stabilization: StabilizationCode | None = None  # the user's own
 
-    info_names: ClassVar[tuple[str, ...]] = INFO  # names of the first numbers of the output "info", before the last q and v
+    info_names: ClassVar[tuple[str, ...]] = INFO_NAMES  # names of the first numbers of the output "info", before the last q and v
 
     @property
     def all_settings(self) -> tuple[str, ...]:
@@ -121,7 +122,7 @@ class RunStates(Operation):
             breakpoints: number of times where the motion is not smooth.
             points: capacity of the record of a run, in accepted states; None: a capacity that is sufficient for most runs.
         """
-        points = points or record.STORED + record.PER_BREAKPOINT * breakpoints
+        points = points or record.STORED_POINTS + record.PER_BREAKPOINT * breakpoints
         return RunCotangents(**self._for_derivatives, active=active, points=points)
 
     def watching(
@@ -152,7 +153,7 @@ class RunStates(Operation):
 
     def outputs(self, inputs: Sequence[Any], times: int) -> list[tuple[int, ...]]:
         n = self.code.coordinate_count
-        return [(times, n), (times, n), (times,), (len(INFO) + 2 * n,)]
+        return [(times, n), (times, n), (times,), (len(INFO_NAMES) + 2 * n,)]
 
 
 @dataclass(frozen=True)
@@ -238,7 +239,7 @@ class RunCotangents(RunStates):
     """
 
     active: tuple[bool, ...] = ()
-    points: int = record.STORED  # capacity of the record of a run; without capacity, runs are integrated again
+    points: int = record.STORED_POINTS  # capacity of the record of a run; without capacity, runs are integrated again
 
     @property
     def record_length(self) -> int:

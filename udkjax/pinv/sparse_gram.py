@@ -14,9 +14,9 @@ from scipy.sparse.linalg import eigsh, splu
 SparseMatrix: TypeAlias = Any  # SciPy's type stubs lack the shape
 
 _SYMMETRIC: dict[str, Any] = {"permc_spec": "MMD_AT_PLUS_A", "options": {"SymmetricMode": True}, "diag_pivot_thresh": 0.0}
-SPARE = 3  # vectors of a block beyond those wanted, which speed up convergence
+SPARE_VECTORS = 3  # vectors of a block beyond those wanted, which speed up convergence
 MOST_ITERATIONS = 100  # of a block; five are usual
-CONVERGED = 8 * float(np.finfo(float).eps)  # change of a value, relative to the largest, that is rounding
+VALUE_TOL = 8 * float(np.finfo(float).eps)  # change of a value, relative to the largest, that is rounding
 LARGEST_TOL = 1e-6  # of the vector of the largest singular value: the error of the value is the square
 
 
@@ -81,16 +81,16 @@ class SmallSingularValues:
     def _iterate(self, start: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
         """Return the smallest values in ascending order, at least one of them nonzero, and their left singular vectors (m, k)."""
         random, rows, factor = np.random.default_rng(0), self._rows, factor_gram(self._A, self._damping)
-        X = random.standard_normal((rows, min(rows, 1 + SPARE))) if start is None else start
+        X = random.standard_normal((rows, min(rows, 1 + SPARE_VECTORS))) if start is None else start
         while True:
             values, X, converged = self._iterate_block(factor, X)
             wanted = self._count_zeros(values) + 1
             if 2 * wanted > rows or not converged:  # many: the dense factorization is as fast
                 u, values, _ = np.linalg.svd(self._A.toarray())
                 return np.pad(values, (0, rows - len(values)))[::-1], u[:, ::-1]
-            if wanted + SPARE <= X.shape[1]:
+            if wanted + SPARE_VECTORS <= X.shape[1]:
                 return values, X
-            X = np.concatenate([X, random.standard_normal((rows, min(rows, 2 * wanted + SPARE) - X.shape[1]))], axis=1)
+            X = np.concatenate([X, random.standard_normal((rows, min(rows, 2 * wanted + SPARE_VECTORS) - X.shape[1]))], axis=1)
 
     def _iterate_block(self, factor: Any, X: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool]:
         values = np.full(X.shape[1], np.inf)
@@ -100,6 +100,6 @@ class SmallSingularValues:
             turn, values, _ = np.linalg.svd(image, full_matrices=image.shape[0] > image.shape[1])
             X, values = X @ turn[:, ::-1], np.pad(values, (0, len(turn) - len(values)))[::-1]
             wanted = self._count_zeros(values) + 1
-            if np.all(np.abs(values - before)[:wanted] <= CONVERGED * self._bounds[1]):
+            if np.all(np.abs(values - before)[:wanted] <= VALUE_TOL * self._bounds[1]):
                 return values, X, True
         return values, X, False

@@ -38,9 +38,10 @@ from udkjax.programs.varying_axes import varies
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
 
-WORTH = 700  # evaluations by NumPy (2 to 3 us per operation) that take as long as compilation (2 ms per operation)
-MOST = 2_000_000  # operations evaluated by NumPy before any program is compiled: ten seconds, as long as the longest compilation
-_SPENT: "WeakKeyDictionary[Any, int]" = WeakKeyDictionary()  # operations evaluated by NumPy so far, by program
+WORTH_COMPILING = 700  # evaluations by NumPy (2 to 3 us per operation) that take as long as compilation (2 ms per operation)
+# Operations evaluated by NumPy before any program is compiled: ten seconds, as long as the longest compilation.
+MOST_NUMPY_OPERATIONS = 2_000_000
+_SPENT_OPERATIONS: "WeakKeyDictionary[Any, int]" = WeakKeyDictionary()  # operations evaluated by NumPy so far, by program
 
 
 def deferred(function: Callable[Arguments, Result], keeps_concrete: bool = False) -> Callable[Arguments, Result]:
@@ -93,7 +94,7 @@ def trace_once(
         The program as a closed jaxpr, the arrays of the arguments, which are its inputs, and the form of the function's result.
     """
     given, tree = jax.tree.flatten((args, kwargs or {}))
-    are_arrays = tuple([isinstance(x, _ARRAYS) for x in given])
+    are_arrays = tuple([isinstance(x, _ARRAY_TYPES) for x in given])
     leaves = [x for x, is_array in zip(given, are_arrays, strict=True) if is_array]
     fixed = tuple([x for x, is_array in zip(given, are_arrays, strict=True) if not is_array])
     program, out = _trace(function, tree, are_arrays, fixed, tuple(map(jax.typeof, leaves)), jax.config.jax_enable_x64)
@@ -180,11 +181,11 @@ def _is_traced(x: Any) -> bool:
     return isinstance(x, Tracer)
 
 
-_ARRAYS = (jax.Array, np.ndarray, np.generic)
+_ARRAY_TYPES = (jax.Array, np.ndarray, np.generic)
 
 
 def _is_array(x: Any) -> bool:
-    return isinstance(x, _ARRAYS)
+    return isinstance(x, _ARRAY_TYPES)
 
 
 class _ClosesOverError(Exception):
@@ -233,23 +234,23 @@ def _trace(
 
 
 def _evaluate(*xs: Any, call_jaxpr: Any) -> list[Array]:
-    spent, limit = _SPENT.get(call_jaxpr, 0), _limit(call_jaxpr)
+    spent, limit = _SPENT_OPERATIONS.get(call_jaxpr, 0), _limit(call_jaxpr)
     if spent < limit and not jax.config.jax_debug_nans:
         meter = Meter(limit - spent)
         try:
             with np.errstate(all="ignore"):
                 results = numpy_program(call_jaxpr)(meter, [np.asarray(x) for x in xs])
         except TooLongError:
-            _SPENT[call_jaxpr] = limit
+            _SPENT_OPERATIONS[call_jaxpr] = limit
         else:
-            _SPENT[call_jaxpr] = spent + meter.count
+            _SPENT_OPERATIONS[call_jaxpr] = spent + meter.count
             return jax.device_put([np.asarray(x, a.dtype) for x, a in zip(results, call_jaxpr.out_avals, strict=True)])
     return _compiled(call_jaxpr)(*xs)
 
 
 @lru_cache(maxsize=512)
 def _limit(program: Any) -> int:
-    return min(WORTH * count_operations(program), MOST)
+    return min(WORTH_COMPILING * count_operations(program), MOST_NUMPY_OPERATIONS)
 
 
 @lru_cache(maxsize=512)

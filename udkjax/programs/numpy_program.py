@@ -13,11 +13,11 @@ import jax
 import numpy as np
 from jax.extend.core import Jaxpr, Literal, Primitive, jaxprs_in_params
 
-from udkjax.programs.numpy_rules import PRESERVED, RULES
+from udkjax.programs.numpy_rules import PRESERVED_DTYPES, RULES
 from udkjax.programs.plain_steps import plain_step
 
 Step = tuple[Callable[..., Any], list[int], Any]  # a function, and the places of its arguments and of its result or results
-ENTRIES = 2_000  # number of array entries that take as long as the overhead of an operation
+ENTRIES_PER_OPERATION = 2_000  # number of array entries that take as long as the overhead of an operation
 
 _EXPANSIONS: dict[Primitive, Callable[..., Callable[..., Any]]] = {}
 _EVALUATIONS: dict[Primitive, Callable[..., Any]] = {}
@@ -108,14 +108,14 @@ class NumpyProgram:
         if key in self._known:  # functions that are called one after another compute the same: JAX traces each of them anew
             return self._known[key]
         function = plain_step(equation.primitive.name, equation.params, [_type(v) for v in (*equation.invars, *equation.outvars)])
-        if function is not None and self._fixed.issuperset(given) and _type(equation.outvars[0]).size <= ENTRIES:
+        if function is not None and self._fixed.issuperset(given) and _type(equation.outvars[0]).size <= ENTRIES_PER_OPERATION:
             with np.errstate(all="ignore"):
                 results = [self._place_of_value(np.asarray(function(*[self._memory[k] for k in given])))]
         else:
             results = [self._new() for _ in equation.outvars]
             if function is None:
                 function, given = _step_of(equation), [0, *given]
-            self._cost += 1 + sum(_type(v).size for v in equation.outvars) // ENTRIES
+            self._cost += 1 + sum(_type(v).size for v in equation.outvars) // ENTRIES_PER_OPERATION
             self._steps.append((function, given, results if equation.primitive.multiple_results else results[0]))
         if key is not None:
             self._known[key] = results
@@ -197,7 +197,7 @@ def has_rules(jaxpr: Any) -> bool:
 
     def has_rule(equation: Any) -> bool:
         primitive = equation.primitive
-        if primitive in _EVALUATIONS or primitive.name in _CALLS or primitive.name in _CONTROL or primitive.name in RULES:
+        if primitive in _EVALUATIONS or primitive.name in _CALLS or primitive.name in _CONTROL_RULES or primitive.name in RULES:
             return all(map(has_rules, jaxprs_in_params(equation.params)))
         expanded = _Expanded(equation).trace()
         return expanded is not None and has_rules(expanded)
@@ -225,8 +225,8 @@ def _step_of(equation: Any) -> Callable[..., Any]:
     primitive, parameters = equation.primitive, equation.params
     if primitive in _EVALUATIONS:
         return lambda _, *xs: _EVALUATIONS[primitive](*xs, **parameters)
-    if primitive.name in _CONTROL:
-        return _CONTROL[primitive.name](**parameters)
+    if primitive.name in _CONTROL_RULES:
+        return _CONTROL_RULES[primitive.name](**parameters)
     rule = RULES.get(primitive.name)
     if rule is not None and not (primitive.name in ("reduce_or", "reduce_and") and equation.invars[0].aval.dtype != bool):
         return _by_rule(equation, rule)
@@ -236,7 +236,7 @@ def _step_of(equation: Any) -> Callable[..., Any]:
 def _by_rule(equation: Any, rule: Callable[..., Any]) -> Callable[..., Any]:
     primitive, parameters = equation.primitive, equation.params
     dtypes = [v.aval.dtype for v in equation.outvars]
-    exact = all(dtype in PRESERVED for dtype in dtypes)
+    exact = all(dtype in PRESERVED_DTYPES for dtype in dtypes)
 
     def step(_: Meter, *xs: Any) -> Any:
         try:
@@ -365,7 +365,7 @@ _CALLS = {
     "remat2": "jaxpr",
 }
 _IDENTITIES = ("stop_gradient", "copy", "copy_p")
-_CONTROL: dict[str, Callable[..., Callable[..., Any]]] = {
+_CONTROL_RULES: dict[str, Callable[..., Callable[..., Any]]] = {
     "while": _while,
     "cond": _cond,
     "scan": _scan,

@@ -13,7 +13,7 @@ from jax import lax
 from udkjax.programs.numpy_indexing import dynamic_slice, dynamic_update_slice, gather, scatter
 
 Rule = Callable[..., Any]
-PRESERVED = (np.dtype(float), np.dtype(int), np.dtype(bool))  # dtypes that every NumPy operation preserves
+PRESERVED_DTYPES = (np.dtype(float), np.dtype(int), np.dtype(bool))  # dtypes that every NumPy operation preserves
 
 
 def _put(x: np.ndarray, places: Any, updates: np.ndarray) -> None:
@@ -291,7 +291,7 @@ RULES: dict[str, Rule] = {name: _ufunc(function) for name, function in UFUNCS.it
 
 
 # Rules whose results equal those of JAX bit by bit: they move elements, compare, or compute with integers.
-_EXACT = frozenset(
+_EXACT_RULES = frozenset(
     """eq ne lt le gt ge and or xor not add sub mul neg iota broadcast_in_dim reshape squeeze expand_dims transpose rev slice pad
     tile concatenate convert_element_type""".split()
 )
@@ -303,7 +303,7 @@ def exact_rule(name: str) -> Rule | None:
 
     For arguments for which this is not certain, the rule returns `NotImplemented`.
     """
-    if name not in _EXACT:
+    if name not in _EXACT_RULES:
         return None
     rule = RULES[name]
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from udkjax.programs.numpy_rules import PRESERVED, RULES, UFUNCS
+from udkjax.programs.numpy_rules import PRESERVED_DTYPES, RULES, UFUNCS
 
 
 def _plain_broadcast(parameters: Mapping[str, Any], types: Sequence[Any]) -> Callable[..., Any]:
@@ -38,7 +38,7 @@ def _plain_reduction(function: np.ufunc, of_bools: bool = False) -> Callable[...
 
 # Functions of the arrays alone, made once from the parameters and the types of inputs and outputs, without a call of Python where
 # NumPy has a method.
-_PLAIN: dict[str, Callable[[Mapping[str, Any], Sequence[Any]], Callable[..., Any] | None]] = {
+_PLAIN_RULES: dict[str, Callable[[Mapping[str, Any], Sequence[Any]], Callable[..., Any] | None]] = {
     "broadcast_in_dim": _plain_broadcast,
     "slice": _plain_slice,
     "reshape": _plain_reshape,
@@ -72,9 +72,9 @@ def plain_step(name: str, parameters: Mapping[str, Any], types: Sequence[Any]) -
     Returns:
         The function, which always succeeds and returns arrays of the right type; None if there is no such function.
     """
-    if any(x.dtype not in PRESERVED for x in types) or len(types) > MOST_INPUTS.get(name, len(types) - 1) + 1:
+    if any(x.dtype not in PRESERVED_DTYPES for x in types) or len(types) > MOST_INPUTS.get(name, len(types) - 1) + 1:
         return None
-    if name in _PLAIN:
-        return _PLAIN[name](parameters, types)
+    if name in _PLAIN_RULES:
+        return _PLAIN_RULES[name](parameters, types)
     function = UFUNCS.get(name)
     return function if isinstance(function, np.ufunc) else None

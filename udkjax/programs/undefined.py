@@ -11,9 +11,9 @@ slopes.
 
 Two linear primitives enclose the linear map of a derivative. `enter` passes on the directions and a token, which is zero; `leave`
 passes on the results of the map, with NaN where values are undefined. In reverse mode, `leave` comes first and drops the
-cotangents of undefined values. The cotangent of the token tells `enter` about them: LOST if one of them was not zero; otherwise a
-number that is zero if no other cotangent is nonzero either. In that case `enter` replaces a NaN that the map makes of zeros by
-zero.
+cotangents of undefined values. The cotangent of the token tells `enter` about them: LOST_COTANGENT if one of them was not zero;
+otherwise a number that is zero if no other cotangent is nonzero either. In that case `enter` replaces a NaN that the map makes of
+zeros by zero.
 """
 
 import functools
@@ -35,7 +35,8 @@ from jaxtyping import Array
 from udkjax.programs.numpy_program import expand_as
 from udkjax.programs.varying_axes import result_type
 
-LOST = np.nan  # cotangent of the token if an undefined value is used; otherwise a count, zero if all cotangents are zero
+# Cotangent of the token if an undefined value is used; otherwise a count, zero if all cotangents are zero.
+LOST_COTANGENT = np.nan
 Result = TypeVar("Result")
 LinearMap = Callable[[list[Array]], Sequence[Array]]
 
@@ -197,7 +198,7 @@ def _leave_transposed(cotangents: Sequence[Any], tangent: Any, token: Any, undef
     if ad.is_undefined_primal(token):
         axes = tuple(range(len(token.aval.shape), bar.ndim))
         is_lost, is_used = (jnp.any(x, axis=axes) for x in (undefined & (bar != 0), remaining != 0))
-        found = jnp.where(is_lost, LOST, is_used.astype(token.aval.dtype))
+        found = jnp.where(is_lost, LOST_COTANGENT, is_used.astype(token.aval.dtype))
     return [remaining if ad.is_undefined_primal(tangent) else None, found, None]
 
 

@@ -422,18 +422,20 @@ class Mechanism(PrintsTable, Model, ConvertsItself):
         return _checked(_copy(self, {"_source": changed, "origin": None if is_concrete(changed) else origin}))
 
 
-_VALID: WeakValueDictionary[int, Source] = WeakValueDictionary()  # sources of mechanisms that were checked, by their identities
-_USABLE: WeakValueDictionary[int, Source] = WeakValueDictionary()  # sources of mechanisms that `require_valid_numbers` accepts
+# Sources of mechanisms that were checked, by their identities.
+_VALID_SOURCES: WeakValueDictionary[int, Source] = WeakValueDictionary()
+# Sources of mechanisms that `require_valid_numbers` accepts.
+_USABLE_SOURCES: WeakValueDictionary[int, Source] = WeakValueDictionary()
 
 
 def _checked(mechanism: Mechanism) -> Mechanism:
     """Return a mechanism after noting that all its elements are valid."""
-    _VALID[id(mechanism._source)] = mechanism._source
+    _VALID_SOURCES[id(mechanism._source)] = mechanism._source
     return mechanism
 
 
 def _is_checked(mechanism: Mechanism) -> bool:
-    return _VALID.get(id(mechanism._source)) is mechanism._source
+    return _VALID_SOURCES.get(id(mechanism._source)) is mechanism._source
 
 
 def require_valid_numbers(mechanism: Mechanism) -> None:
@@ -443,11 +445,11 @@ def require_valid_numbers(mechanism: Mechanism) -> None:
     Equinox module takes longer.
     """
     source = mechanism._source
-    if _VALID.get(id(source)) is source or _USABLE.get(id(source)) is source or not is_concrete(mechanism):
+    if _VALID_SOURCES.get(id(source)) is source or _USABLE_SOURCES.get(id(source)) is source or not is_concrete(mechanism):
         return
     if not numbers_are_valid(mechanism.elements):
         mechanism.with_parameters({})  # raises the error
-    _USABLE[id(source)] = source
+    _USABLE_SOURCES[id(source)] = source
 
 
 def _check_without_derivatives(mechanism: Mechanism, values: dict[str, Any]) -> None:

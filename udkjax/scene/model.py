@@ -18,7 +18,7 @@ from udkjax.scene.numbers.number_fields import NumberField, must_be_positive
 from udkjax.scene.numbers.units import units_of
 from udkjax.wording import join_names, quote
 
-_NONE: Mapping[str, Any] = MappingProxyType({})
+_NO_NUMBERS: Mapping[str, Any] = MappingProxyType({})
 
 
 class RunModel(QuickMethods):
@@ -47,12 +47,12 @@ class RunModel(QuickMethods):
     @property
     def constraints(self) -> Mapping[str, Any]:
         """The joints and drivers by name, in the order of the rows."""
-        return _NONE
+        return _NO_NUMBERS
 
     @property
     def forces(self) -> Mapping[str, Any]:
         """The force elements by name."""
-        return _NONE
+        return _NO_NUMBERS
 
     @property
     def coordinate_count(self) -> int:

@@ -14,7 +14,7 @@ from udkjax.wording import quote
 # A point farther from its body's centre of mass than this many sizes of the largest body is probably in a wrong unit (mm).
 # The size of a body is the largest distance of its other points, or twice its radius of gyration.
 FAR_OUT = 50.0
-ANGLES = ("angle", "axis", "phase")  # fields in radians
+ANGLE_FIELDS = ("angle", "axis", "phase")  # fields in radians
 
 
 def suspicions(mechanism: Mechanism) -> list[str]:
@@ -61,7 +61,7 @@ def _comparison(size: float) -> str:
 def _degrees(mechanism: Mechanism) -> Iterator[str]:
     """Iterate over angles of more than a turn that are integers or half-integers, like degrees and unlike radians."""
     for name, value in mechanism.parameters().items():
-        if name.rpartition(".")[2] in ANGLES and np.ndim(value) == 0:
+        if name.rpartition(".")[2] in ANGLE_FIELDS and np.ndim(value) == 0:
             angle = float(value)
             if abs(angle) > 2 * np.pi and (2 * angle).is_integer():
                 yield f"{name} is {angle:g} rad, which looks like degrees: {angle:g} degrees are {np.radians(angle):.6g} rad"

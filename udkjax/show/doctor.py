@@ -21,7 +21,7 @@ from udkjax.scene.library import double_pendulum
 from udkjax.study.members import processor
 from udkjax.threads import cores, thread_count
 
-FLAGS = ("JAX_", "UDKJAX_", "XLA_", "CUDA_VISIBLE_DEVICES", "OMP_NUM_THREADS")
+FLAG_PREFIXES = ("JAX_", "UDKJAX_", "XLA_", "CUDA_VISIBLE_DEVICES", "OMP_NUM_THREADS")
 
 
 def facts(run: Callable[..., Solution] = simulate) -> dict[str, Any]:
@@ -48,7 +48,7 @@ def facts(run: Callable[..., Solution] = simulate) -> dict[str, Any]:
         "cache_refused": None if folder is None else refusal(folder),
         "cached_programs": len(sizes),
         "cached_bytes": sum(sizes),
-        "environment": {key: value for key, value in sorted(os.environ.items()) if key.startswith(FLAGS)},
+        "environment": {key: value for key, value in sorted(os.environ.items()) if key.startswith(FLAG_PREFIXES)},
         "advice": list(_advice(engine, reason)),
     }
 

@@ -42,7 +42,7 @@ WIDE_SCENE_RATIO = 1.5  # scenes with a larger ratio of width to height are draw
 SMALLEST_VIOLATION = 1e-17  # smallest violation that is drawn (m, rad), since zero has no logarithm
 SAME_ANGLE = 1e-6  # curves that differ by less (rad) are drawn as one
 MOST_TICKS = 6  # number of labels along an axis of the plane; more would touch
-_CIRCLE = np.column_stack([f(np.linspace(0, 2 * np.pi, 73)[:-1]) for f in (np.cos, np.sin)])
+_UNIT_CIRCLE = np.column_stack([f(np.linspace(0, 2 * np.pi, 73)[:-1]) for f in (np.cos, np.sin)])
 
 
 def trajectory(mech: Mechanism, sol: Solution, ghosts: int = 5) -> Figure:
@@ -240,7 +240,7 @@ def _outlines(drawn: Sequence[Mark]) -> Iterator[tuple[int, Float[np.ndarray, "p
             yield mark["body"], np.add(mark["points"], mark.get("at", (0.0, 0.0))), mark.get("closed", True)
             yield from ((mark["body"], np.asarray(hole), True) for hole in mark.get("holes", ()))
         elif mark["kind"] in (MarkKind.WHEEL, MarkKind.DISC):
-            yield mark["body"], np.add(mark["at"], mark["radius"] * _CIRCLE), True
+            yield mark["body"], np.add(mark["at"], mark["radius"] * _UNIT_CIRCLE), True
 
 
 def _units(mech: Mechanism) -> Units:

@@ -19,8 +19,8 @@ with OptionalImport():
 
 MOST_NUMBERS = 8  # numbers of a corner plot; with more, panels are too small
 MOST_POINTS = 2000  # points of a panel, which would hide each other
-SHOWN = 0.001, 0.999  # quantiles of the draws at the ends of an axis
-LEVELS = {0.5: "--", 0.95: "-"}  # joint confidence of the ellipses, and their dashes
+SHOWN_QUANTILES = 0.001, 0.999  # quantiles of the draws at the ends of an axis
+CONFIDENCE_DASHES = {0.5: "--", 0.95: "-"}  # joint confidence of the ellipses, and their dashes
 
 
 @checked
@@ -87,7 +87,7 @@ def draw_pair(axes: Axes, posterior: Posterior, one: str, other: str, estimate: 
     every = -(-len(x) // MOST_POINTS)
     axes.scatter(x[::every], y[::every], 3, COLOURS[4], lw=0, alpha=0.6, label="draws", rasterized=True)
     if estimate is not None and {one, other} <= {*estimate.names}:
-        for level, dashes in LEVELS.items():
+        for level, dashes in CONFIDENCE_DASHES.items():
             ellipse = estimate.ellipse(one, other, level)
             closed = np.concatenate([ellipse, ellipse[:1]])
             axes.plot(*closed.T, dashes, color=COLOURS[1], lw=1.2, label=f"identify, {100 * level:g} %")
@@ -97,7 +97,7 @@ def draw_pair(axes: Axes, posterior: Posterior, one: str, other: str, estimate: 
 
 
 def _range(values: np.ndarray) -> tuple[float, float]:
-    low, high = np.quantile(values, SHOWN).tolist()
+    low, high = np.quantile(values, SHOWN_QUANTILES).tolist()
     margin = 0.05 * (high - low) or 1.0
     return low - margin, high + margin
 

@@ -30,7 +30,7 @@ OTHER_RESULT = "not computed"  # label of codes outside `Result`
 RESULT_COLOURS = ("#d9d9d9", *COLOURS[1:6], "white")
 MISSING_COLOUR = "0.75"  # grey level of missing values
 LOGARITHMIC_RATIO = 1e2  # colours and axes are logarithmic if the ratio of the largest to the smallest value exceeds this
-COLUMNS = 4  # number of columns of panels
+MOST_COLUMNS = 4  # number of columns of panels
 MOST_PANELS = 12  # number of panels in one picture; of other dimensions only the first values are drawn
 
 
@@ -60,7 +60,7 @@ def _dims(data: "xarray.Dataset") -> tuple[str, ...]:
 def _picture(data: "xarray.Dataset", name: str, most_panels: int) -> Figure:
     across, panels = _layout(data, most_panels)
     count, others = len(panels), [d for d in _dims(data) if d not in across]
-    columns = min(count, COLUMNS, data.sizes[others[-1]] if others else 1)
+    columns = min(count, MOST_COLUMNS, data.sizes[others[-1]] if others else 1)
     rows = -(-count // columns)
     figure = Figure(figsize=(1.2 + 3.4 * columns, 0.8 + 2.9 * rows), layout="constrained")
     grid = np.atleast_1d(figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)).ravel()

@@ -35,8 +35,8 @@ from udkjax.scene.mechanism import Mechanism
 from udkjax.statics.load_scale import load_sizes
 from udkjax.transforms.gradients import stop_gradients
 
-UNBALANCED = 1e-9  # loads along motions other than the coordinate's, relative to all loads; rounding leaves 1e-15
-LOADED = 1e-12  # friction of a joint, relative to all loads; rounding leaves 1e-15
+UNBALANCED_TOL = 1e-9  # loads along motions other than the coordinate's, relative to all loads; rounding leaves 1e-15
+LOADED_TOL = 1e-12  # friction of a joint, relative to all loads; rounding leaves 1e-15
 MOST_TANGENTS = 50  # three to six are usual
 LAST_CHANGE = 1e-13  # of the bound, relative, by the last tangents
 # Relative to all loads: friction at which the first tangents are taken, so that forces of unloaded joints have a direction, too.
@@ -106,7 +106,7 @@ def reactions_at(
         return work - J.T @ (plus.T @ work)
 
     left = unbalanced(friction)
-    takes_part = jnp.linalg.norm(left, axis=0) <= UNBALANCED * jnp.linalg.norm(friction, axis=0)
+    takes_part = jnp.linalg.norm(left, axis=0) <= UNBALANCED_TOL * jnp.linalg.norm(friction, axis=0)
     found = Reactions(
         multipliers=(plus.T @ force) / analysis.row_units,
         by_friction=jnp.where(takes_part, plus.T @ friction, 0.0) / analysis.row_units[:, None],
@@ -164,7 +164,7 @@ def largest_effort(mechanism: Mechanism, reactions: Reactions, sign: float) -> F
         z, base = search.z, jnp.where(search.count == 0, search.z + aside, search.z)
         slope = jax.jacfwd(lambda z: limits(scene, fixed, z))(base)
         available = limits(scene, fixed, base) + slope @ (z - base)
-        is_unloaded = (available - constant <= LOADED * fixed.scale) & (search.count > 0)
+        is_unloaded = (available - constant <= LOADED_TOL * fixed.scale) & (search.count > 0)
         slope = jnp.where(is_unloaded[:, None], -search.slope, slope)
         rows = jnp.concatenate([sides - slope, -sides - slope])
         left = jnp.concatenate([available - z[:K], available + z[:K]])
@@ -208,6 +208,6 @@ def friction_holds_around(mechanism: Mechanism, analysis: Analysis, t: Time, q: 
     if not free:
         return jnp.asarray(False)
     available = limits(mechanism, reactions, jnp.zeros(len(reactions.units) + reactions.internal.shape[1]))
-    resists = jnp.where(available > LOADED * reactions.scale, balance.friction, 0.0)
+    resists = jnp.where(available > LOADED_TOL * reactions.scale, balance.friction, 0.0)
     sigma = jnp.linalg.svd(jnp.pad(resists, ((0, 0), (0, free))), compute_uv=False)
     return sigma[free - 1] > determinacy.STATIC_RANK_TOL

@@ -44,7 +44,7 @@ Trial: TypeAlias = tuple[Array, Array, Array, Array, Linearization]
 IsTrue: TypeAlias = Bool[Array, ""]  # named, since annotations of inner functions are evaluated at each call
 # q, the linearization at q, the number of steps, whether the last was better, whether steps go downhill.
 Settling: TypeAlias = tuple[Array, Linearization, Array, Array, Array]
-REST = "an equilibrium needs positions that the constraints determine"
+REST_REQUIREMENT = "an equilibrium needs positions that the constraints determine"
 
 
 class Equilibrium(PrintsTable):
@@ -157,7 +157,7 @@ def equilibrium(
         ValueError: all numbers are traced, so that the number of degrees of freedom is unknown.
     """
     _require_weights(mechanism)
-    refuse_rolling(mechanism, REST)
+    refuse_rolling(mechanism, REST_REQUIREMENT)
     analysis = analyse(mechanism) if analysis is None else analysis
     free = degrees_of_freedom(analysis)
     t = np.asarray(t, float) if mechanism.is_concrete and not is_traced(t) else number(t)
@@ -191,7 +191,7 @@ def equilibria(
         A list of `Equilibrium`, the most stable first: by their lowest omega^2, descending.
     """
     _require_weights(mechanism)
-    refuse_rolling(mechanism, REST)
+    refuse_rolling(mechanism, REST_REQUIREMENT)
     analysis = analyse(mechanism)
     guesses = random_positions(mechanism, starts, seed, state)
 

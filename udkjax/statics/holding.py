@@ -25,12 +25,12 @@ from udkjax.printing import PrintedTable, PrintsTable, fields_table, format_numb
 from udkjax.programs.deferred import deferred
 from udkjax.scene.arguments import checked
 from udkjax.scene.mechanism import Mechanism
-from udkjax.statics.admissible_reactions import UNBALANCED, largest_effort, reactions_at
+from udkjax.statics.admissible_reactions import UNBALANCED_TOL, largest_effort, reactions_at
 from udkjax.wording import join_names
 
 # Missing part of the unit speed along the coordinate. Where the coordinate moves, rounding errors are below 1e-8; at dead points
 # other rows take a good share of the speed.
-STOPPED = 1e-5
+STOPPED_TOL = 1e-5
 
 
 class HoldingEfforts(PrintsTable):
@@ -146,7 +146,7 @@ def _efforts(
 ) -> tuple[list[Array], Array, Array]:
     def at(q: Array) -> tuple[list[Array], Array, Array]:
         reactions, balance = reactions_at(mechanism, analysis, 0.0, q, row)
-        known = (jnp.abs(balance.motion - 1) < STOPPED) & (balance.force <= UNBALANCED * reactions.scale)
+        known = (jnp.abs(balance.motion - 1) < STOPPED_TOL) & (balance.force <= UNBALANCED_TOL * reactions.scale)
         signs = -1.0, 1.0
         bounds = [sign * largest_effort(mechanism, reactions.without_internal, sign) for sign in signs]
         by_preload = jnp.zeros(2, bool)

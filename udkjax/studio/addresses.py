@@ -6,8 +6,8 @@ import zlib
 
 from udkjax.studio.limits import MOST_ADDRESS_CHARACTERS, MOST_TEXT_CHARACTERS, RefusedError
 
-KEY = "drawing="
-SCHEME = f"udkjax:{KEY}"
+DRAWING_KEY = "drawing="
+SCHEME = f"udkjax:{DRAWING_KEY}"
 MOST_BYTES = 4 * MOST_TEXT_CHARACTERS  # of a text in UTF-8
 
 
@@ -26,7 +26,7 @@ def address_of(text: str) -> str:
 
 def is_address(words: str) -> bool:
     """Return True if words are meant as the address of a drawing, even a damaged one; a path of a .toml file is none."""
-    return KEY in words and not words.endswith(".toml")
+    return DRAWING_KEY in words and not words.endswith(".toml")
 
 
 def text_of(address: str) -> str:
@@ -35,9 +35,9 @@ def text_of(address: str) -> str:
     Raises:
         RefusedError: the words are not the address of a drawing, the address is damaged, or the drawing is too long.
     """
-    if KEY not in address:
+    if DRAWING_KEY not in address:
         raise RefusedError(400, f"this is no address of a drawing, which begins with {SCHEME}")
-    word = re.split(r"[^\w-]", re.sub(r"\s", "", address.partition(KEY)[2]), maxsplit=1, flags=re.ASCII)[0]
+    word = re.split(r"[^\w-]", re.sub(r"\s", "", address.partition(DRAWING_KEY)[2]), maxsplit=1, flags=re.ASCII)[0]
     word = word[: len(word) - (len(word) % 4 == 1)]  # no data has this length: words of the message follow
     try:
         packed = zlib.decompressobj()

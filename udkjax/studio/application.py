@@ -30,14 +30,15 @@ from udkjax.annotations import JsonObject
 from udkjax.scene.drawing.drawn_quantities import Units
 from udkjax.studio.addresses import address_of, text_of
 from udkjax.studio.folder import Folder
-from udkjax.studio.gate import INTERFACE, Gate
+from udkjax.studio.gate import API_PREFIX, Gate
 from udkjax.studio.limits import COMPILE_SECONDS, DIAGNOSE_SECONDS, EXPORT_SECONDS, RefusedError, require_size
 from udkjax.studio.worker import Worker, WorkerPool
 
 MEDIA_TYPES = {".html": "text/html", ".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
-FOLDERS = {"": ("udkjax.studio", "page"), "player/": ("udkjax.show.player", ".")}  # package and folder of each address prefix
+# Package and folder of each address prefix.
+PAGE_FOLDERS = {"": ("udkjax.studio", "page"), "player/": ("udkjax.show.player", ".")}
 UNIT_SIZES = "unit_sizes.js"  # a module of the page that is made from the package's table of units
-EXPORTS = (".html", ".svg", ".png", ".gif", ".mp4", ".dxf", ".csv", ".py")
+EXPORT_SUFFIXES = (".html", ".svg", ".png", ".gif", ".mp4", ".dxf", ".csv", ".py")
 
 
 class Studio:
@@ -81,16 +82,16 @@ class Studio:
             raise RefusedError(400, "revision: must be a string, or null for a new file")
         if not request.get("export"):
             return {"path": path, "revision": self.folder.write(path, text.encode(), revision)}
-        suffix = self.folder.locate(path, EXPORTS).suffix.lower()
+        suffix = self.folder.locate(path, EXPORT_SUFFIXES).suffix.lower()
         if suffix == ".csv" and isinstance(request.get("table"), str):  # the curves of the page
             data = request["table"].encode()
-            return {"path": path, "revision": self.folder.write(path, data, revision, EXPORTS), "bytes": len(data)}
+            return {"path": path, "revision": self.folder.write(path, data, revision, EXPORT_SUFFIXES), "bytes": len(data)}
         shown = {"pose": request.get("pose") or {}, "has_gaps": request.get("gaps") is True}
         if not isinstance(shown["pose"], dict):
             raise RefusedError(400, "pose: must be an object")
         exported = self.examiner.call("export", {"text": text, "suffix": suffix, **shown}, EXPORT_SECONDS)
         data = bytes.fromhex(exported["data"])
-        return {"path": path, "revision": self.folder.write(path, data, revision, EXPORTS), "bytes": len(data)}
+        return {"path": path, "revision": self.folder.write(path, data, revision, EXPORT_SUFFIXES), "bytes": len(data)}
 
     def compile(self, request: JsonObject) -> JsonObject:
         """Return a drawing's text and tables, its mistakes, and, if an `engine` is requested, the data that move it."""
@@ -128,7 +129,7 @@ def application(studio: Studio, port: int, token: str) -> ASGIApp:
         token: token that each request to the interface must carry.
     """
     actions = [studio.list, studio.open, studio.share, studio.save, studio.compile, studio.diagnose, studio.design]
-    routes = [Route(f"{INTERFACE}{action.__name__}", _answering(action), methods=["POST"]) for action in actions]
+    routes = [Route(f"{API_PREFIX}{action.__name__}", _answering(action), methods=["POST"]) for action in actions]
     return Gate(Starlette(routes=[*routes, Route("/{path:path}", _page_file)]), port, token)
 
 
@@ -160,7 +161,7 @@ async def _page_file(request: Request) -> Response:
 def page_files() -> Mapping[str, tuple[bytes, str]]:
     """Return the content and the media type of each file of the page, by its path on the server."""
     contents = {UNIT_SIZES: (_unit_sizes().encode(), MEDIA_TYPES[".js"])}
-    for prefix, (package, folder) in FOLDERS.items():
+    for prefix, (package, folder) in PAGE_FOLDERS.items():
         root = files(package).joinpath(folder)
         if root.is_dir():
             for entry in root.iterdir():

@@ -18,7 +18,7 @@ from udkjax.study.diagnosis.fixes import Fix
 
 ROUNDING = 1e-9  # relative: a drawing that is read again has the same bodies to this
 DIGITS = 12  # decimals of the components of a direction, and digits of a centre
-SHAPE = ("density", "thickness", "width", "outline", "mass", "inertia", "centre")  # keys that give a link its mass
+MASS_KEYS = ("density", "thickness", "width", "outline", "mass", "inertia", "centre")  # keys that give a link its mass
 
 
 def drawn_fix(text: str, mechanism: Mechanism, fix: Fix) -> JsonObject:
@@ -84,7 +84,7 @@ def _without_pin(tables: Document, mechanism: Mechanism, joint: Revolute, constr
             links = []
             for link in tables["link"]:
                 pins = [name for name in link["pins"] if name != pin]
-                kept = {key: x for key, x in link.items() if not (numbers and key in SHAPE)}
+                kept = {key: x for key, x in link.items() if not (numbers and key in MASS_KEYS)}
                 more = _body_numbers(mechanism, body) if numbers else {}
                 links.append({**kept, "pins": pins, **more} if link["name"] == body else link)
             yield {**tables, "link": links}

@@ -21,7 +21,7 @@ from udkjax.statics.reaction_peaks import RestingPositions
 from udkjax.studio.limits import RefusedError
 from udkjax.studio.shown_runs import INSTANTS, duration_of, shown_run
 
-SCRIPT = '''"""{title}, drawn in the udkjax studio."""
+SCRIPT_TEMPLATE = '''"""{title}, drawn in the udkjax studio."""
 
 import numpy as np
 
@@ -36,8 +36,9 @@ print(sol)
 udk.animate(mech, sol).save("motion.html")
 '''
 
-LABELLED = (".svg", ".png", ".dxf")  # pictures with the names of points and the lengths of links
-FORMULA = ("=", "+", "-", "@", "\t")  # a spreadsheet evaluates cells that begin like this, unless an apostrophe comes first
+LABELLED_SUFFIXES = (".svg", ".png", ".dxf")  # pictures with the names of points and the lengths of links
+# A spreadsheet evaluates cells that begin like this, unless an apostrophe comes first.
+FORMULA_STARTS = ("=", "+", "-", "@", "\t")
 
 
 def exported(mechanism: Mechanism, text: str, suffix: str, pose: JsonObject | None = None, has_gaps: bool = False) -> bytes:
@@ -57,7 +58,7 @@ def exported(mechanism: Mechanism, text: str, suffix: str, pose: JsonObject | No
     """
     if suffix == ".py":
         return script(mechanism, text).encode()
-    if suffix in LABELLED:
+    if suffix in LABELLED_SUFFIXES:
         run, t = _posed(mechanism, pose or {})
         options = {"t": t, "labels": True}
     else:
@@ -105,7 +106,7 @@ def script(mechanism: Mechanism, text: str) -> str:
     """Return a Python script that simulates and shows a drawing."""
     title = " ".join(mechanism.name.split()).replace("\\", "").replace('"', "'") or "A mechanism"
     lines = "".join(f"    {line!r}\n" for line in text.splitlines(keepends=True))
-    return SCRIPT.format(title=title, scene=f"(\n{lines})", duration=duration_of(mechanism), instants=INSTANTS)
+    return SCRIPT_TEMPLATE.format(title=title, scene=f"(\n{lines})", duration=duration_of(mechanism), instants=INSTANTS)
 
 
 def table(mechanism: Mechanism, run: StateHistory) -> str:
@@ -114,7 +115,7 @@ def table(mechanism: Mechanism, run: StateHistory) -> str:
     units = ("x (m)", "y (m)", "angle (rad)")
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
-    names = [f"'{body}" if body.startswith(FORMULA) else body for body in mechanism.bodies]
+    names = [f"'{body}" if body.startswith(FORMULA_STARTS) else body for body in mechanism.bodies]
     writer.writerow(["time (s)", *(f"{name} {unit}" for name in names for unit in units)])
     writer.writerows([repr(float(t)), *map(repr, row)] for t, row in zip(np.asarray(run.ts), q.tolist(), strict=True))
     return out.getvalue()

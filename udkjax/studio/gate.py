@@ -16,8 +16,8 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from udkjax.studio.limits import MOST_BODY_BYTES, RefusedError
 
 TOKEN_HEADER = "x-studio-token"
-INTERFACE = "/api/"
-NAMES = ("127.0.0.1", "localhost")  # names of this machine
+API_PREFIX = "/api/"
+HOST_NAMES = ("127.0.0.1", "localhost")  # names of this machine
 POLICY = (
     "default-src 'none'; script-src 'self' 'wasm-unsafe-eval'; style-src 'self'; img-src 'self' blob: data:; connect-src 'self'; "
     "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -44,7 +44,7 @@ class Gate:
 
     def __init__(self, app: ASGIApp, port: int, token: str):
         self.app, self.token = app, token
-        self.hosts = {f"{name}:{port}" for name in NAMES}
+        self.hosts = {f"{name}:{port}" for name in HOST_NAMES}
         self.origins = {f"http://{host}" for host in self.hosts}
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -62,7 +62,7 @@ class Gate:
         try:
             body = None
             self._check(scope)
-            if scope["path"].startswith(INTERFACE):
+            if scope["path"].startswith(API_PREFIX):
                 body = await _read(receive, Headers(scope=scope))
         except RefusedError as error:
             await JSONResponse({"problem": str(error)}, error.status)(scope, receive, sent)
@@ -77,7 +77,7 @@ class Gate:
             raise RefusedError(421, "this server answers only as 127.0.0.1 or localhost")
         if any(origin not in self.origins for origin in origins):
             raise RefusedError(403, "requests from other sites are refused")
-        if not scope["path"].startswith(INTERFACE):
+        if not scope["path"].startswith(API_PREFIX):
             if scope["method"] not in ("GET", "HEAD"):
                 raise RefusedError(405, "the files of the page are read-only")
             return

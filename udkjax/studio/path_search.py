@@ -17,10 +17,10 @@ from udkjax.synthesis.curves.mechanisms_for import mechanisms_for
 # Largest number of bars, and CPU time (s), of the first search and the following ones: simple mechanisms appear at once.
 EFFORTS = ((6, 3.0), (8, 8.0), (10, 16.0), (12, 30.0))
 RESULTS = 4
-FEWEST, MOST = 3, 10_000  # points of a wanted path
-CLOSED = 0.08  # a path drawn by hand whose ends are nearer, relative to its length, is closed
-TRANSMISSION = float(np.deg2rad(20.0))  # least transmission angle (rad)
-PART = 500  # points whose distances are computed at once, to bound the memory
+FEWEST_POINTS, MOST_POINTS = 3, 10_000  # points of a wanted path
+CLOSED_GAP = 0.08  # a path drawn by hand whose ends are nearer, relative to its length, is closed
+LEAST_TRANSMISSION = float(np.deg2rad(20.0))  # least transmission angle (rad)
+POINTS_AT_ONCE = 500  # points whose distances are computed at once, to bound the memory
 DIGITS = 6  # of the written numbers
 
 
@@ -46,12 +46,12 @@ def find_mechanisms(path: object, unit: str = "mm", seed: int = 0) -> JsonObject
     if not extent > 0:
         raise RefusedError(400, "path: its points are all in the same place")
     way = float(np.sum(np.linalg.norm(np.diff(points, axis=0), axis=1)))
-    if np.linalg.norm(points[-1] - points[0]) <= CLOSED * way:
+    if np.linalg.norm(points[-1] - points[0]) <= CLOSED_GAP * way:
         points = np.concatenate([points, points[:1]])
     bars, seconds = EFFORTS[min(seed, len(EFFORTS) - 1)]
     given: dict[str, Any] = {"bars": bars, "seconds": seconds, "seed": seed, "results": RESULTS, "unit": unit}
     try:
-        found = mechanisms_for(points, transmission=TRANSMISSION, slides=seed % 2 == 1, progress=False, **given)
+        found = mechanisms_for(points, transmission=LEAST_TRANSMISSION, slides=seed % 2 == 1, progress=False, **given)
     except ValueError as problem:
         raise RefusedError(400, f"path: {problem}") from None
     designs = [_drawn(design, points) for design in found]
@@ -72,15 +72,15 @@ def _points(path: object) -> np.ndarray:
         points = np.asarray(path, float)
     except (TypeError, ValueError):
         points = np.zeros((0, 2))
-    if points.shape[1:] != (2,) or not FEWEST <= len(points) <= MOST or not np.isfinite(points).all():
-        raise RefusedError(400, f"path: must be a list of {FEWEST} to {MOST} places [x, y]")
+    if points.shape[1:] != (2,) or not FEWEST_POINTS <= len(points) <= MOST_POINTS or not np.isfinite(points).all():
+        raise RefusedError(400, f"path: must be a list of {FEWEST_POINTS} to {MOST_POINTS} places [x, y]")
     return points
 
 
 def _drawn(design: CurveDesign, points: np.ndarray) -> JsonObject:
     """Return a design as a drawing, with the largest distance of `points` from its curve."""
     text = merge_document("", _rounded(read_document(dumps(design.mechanism))))
-    parts = np.array_split(points, 1 + len(points) // PART)
+    parts = np.array_split(points, 1 + len(points) // POINTS_AT_ONCE)
     off = max(distances_from_segments(part, design.curve[:-1], design.curve[1:]).min(1).max() for part in parts)
     return {
         "document": read_document(text),

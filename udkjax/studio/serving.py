@@ -9,7 +9,7 @@ from pathlib import Path
 from urllib.parse import quote
 
 from udkjax.extras import OptionalImport
-from udkjax.studio.addresses import KEY, is_address
+from udkjax.studio.addresses import DRAWING_KEY, is_address
 from udkjax.studio.folder import Folder
 
 with OptionalImport():
@@ -42,7 +42,13 @@ def serve(root: Path, opened: str = "", port: int = 0, browse: bool = True, say:
         listener.listen()  # so that early connections wait for the server instead of being refused
         bound = listener.getsockname()[1]
         app = application(Studio(Folder(root), *workers), bound, token)
-        drawing = f"&{KEY}{quote(opened.partition(KEY)[2])}" if is_address(opened) else f"&f={quote(opened)}" if opened else ""
+        drawing = (
+            f"&{DRAWING_KEY}{quote(opened.partition(DRAWING_KEY)[2])}"
+            if is_address(opened)
+            else f"&f={quote(opened)}"
+            if opened
+            else ""
+        )
         address = f"http://{LOOPBACK}:{bound}/#t={token}{drawing}"
         config = uvicorn.Config(app, log_level="warning", access_log=False, server_header=False, lifespan="off", ws="none")
         try:

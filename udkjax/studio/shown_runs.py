@@ -19,9 +19,9 @@ from udkjax.scene.tables.checks import SceneError
 from udkjax.show.player.marks.measure_curves import measures_of
 from udkjax.statics.reaction_peaks import RestingPositions, pin_reactions, unique_pin_forces
 
-TURNS = 2  # turns of the slowest motor in a run
-SWINGS = 12  # duration of a run without motors, in characteristic times
-STILL = 1.0  # s: duration of a run in which nothing moves
+MOTOR_TURNS = 2  # turns of the slowest motor in a run
+FREE_SWINGS = 12  # duration of a run without motors, in characteristic times
+STILL_SECONDS = 1.0  # s: duration of a run in which nothing moves
 INSTANTS = 401  # output times of a run: two hundred per turn
 DIGITS = 2  # significant digits of a duration
 TOLERANCE = 1e-8  # rtol and atol of a run
@@ -36,9 +36,9 @@ def duration_of(mechanism: Mechanism) -> float:
     scales, durations = analyse(mechanism), []
     for name, driver in mechanism.drivers.items():
         if (speed := constant_speed(mechanism, name)) != 0:
-            durations.append((TURNS * 2 * math.pi if driver.coordinate == "angle" else float(scales.length)) / abs(speed))
+            durations.append((MOTOR_TURNS * 2 * math.pi if driver.coordinate == "angle" else float(scales.length)) / abs(speed))
     swing = float(scales.time)
-    exact = max(durations) if durations else SWINGS * swing if math.isfinite(swing) else STILL
+    exact = max(durations) if durations else FREE_SWINGS * swing if math.isfinite(swing) else STILL_SECONDS
     return float(f"{exact:.{DIGITS}g}")
 
 

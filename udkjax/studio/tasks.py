@@ -28,7 +28,7 @@ from udkjax.studio.wording import in_studio_words, studio_words
 
 Maker = Callable[[], Mechanism]
 # Templates for new drawings, files of the folder `drawings`: mechanisms that a motor or a spring moves.
-DRAWN: Mapping[str, str] = {
+DRAWN_TEMPLATES: Mapping[str, str] = {
     "crank_rocker": "Crank-rocker",
     "quick_return": "Quick return of a shaping machine",
     "toggle_press": "Toggle press",
@@ -39,7 +39,7 @@ DRAWN: Mapping[str, str] = {
     "door_closer": "Door closer",
 }
 # Further templates: mechanisms of the library, as drawings.
-TEMPLATES: Mapping[str, tuple[str, Maker]] = {
+LIBRARY_TEMPLATES: Mapping[str, tuple[str, Maker]] = {
     "four_bar": ("Four-bar linkage", library.four_bar),
     "slider_crank": ("Slider-crank", library.slider_crank),
     "parallelogram": ("Five-bar parallelogram with a redundant link", library.parallelogram),
@@ -60,13 +60,13 @@ TEMPLATES: Mapping[str, tuple[str, Maker]] = {
 
 def list_templates() -> JsonObject:
     """Return the names and titles of the templates."""
-    titles = {**DRAWN, **{name: title for name, (title, _) in TEMPLATES.items()}}
+    titles = {**DRAWN_TEMPLATES, **{name: title for name, (title, _) in LIBRARY_TEMPLATES.items()}}
     return {"templates": [{"name": name, "title": title} for name, title in titles.items()]}
 
 
 def open_template(name: str) -> JsonObject:
     """Return a template as `open_text` does; raise `RefusedError` if there is no template of this name."""
-    if not isinstance(name, str) or name not in {**DRAWN, **TEMPLATES}:
+    if not isinstance(name, str) or name not in {**DRAWN_TEMPLATES, **LIBRARY_TEMPLATES}:
         raise RefusedError(404, f"there is no template {name!r}")
     return open_text(template_text(name))
 
@@ -270,6 +270,6 @@ def read_path(name: str, text: str, unit: str) -> JsonObject:
 
 def template_text(name: str) -> str:
     """Return a template as the text of a drawing."""
-    if name in DRAWN:
+    if name in DRAWN_TEMPLATES:
         return files("udkjax.studio").joinpath(f"drawings/{name}.toml").read_text(encoding="utf-8")
-    return drawing_text_of(TEMPLATES[name][1]())
+    return drawing_text_of(LIBRARY_TEMPLATES[name][1]())

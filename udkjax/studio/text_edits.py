@@ -16,7 +16,7 @@ from udkjax.studio.limits import require_few, require_size
 
 Document = dict[str, Any]
 NEW_TABLES = ("numbers", "pins", "velocities")  # tables that are written with a header
-HEADED = (*LISTS, "body", "joint", "driver", "force")  # lists whose entries are written with a header
+HEADED_SECTIONS = (*LISTS, "body", "joint", "driver", "force")  # lists whose entries are written with a header
 
 
 def read_document(text: object) -> Document:
@@ -124,7 +124,7 @@ def _mark(table: Mapping[str, Any]) -> str:
 def _fresh(key: str, value: Any, depth: int) -> Any:
     if depth == 0 and key in NEW_TABLES and isinstance(value, Mapping):
         return _fresh_table(value)
-    if depth == 0 and key in HEADED and isinstance(value, list) and _is_tables(value):
+    if depth == 0 and key in HEADED_SECTIONS and isinstance(value, list) and _is_tables(value):
         tables = tomlkit.aot()
         for table in value:
             tables.append(_fresh_table(table))

@@ -1,6 +1,6 @@
 """Messages of the package in the words of the studio: acts of the page instead of arguments, classes and commands.
 
-`WORDS` has the messages whose cure is an act of the page. What then still speaks of Python is left out, clause by clause.
+`STUDIO_WORDS` has the messages whose cure is an act of the page. What then still speaks of Python is left out, clause by clause.
 """
 
 import re
@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from typing import Any
 
 # Patterns of messages, and the words in their place; tools have their names and keys in parentheses.
-WORDS: Mapping[str, str] = {
+STUDIO_WORDS: Mapping[str, str] = {
     r"driver: the scene has no driver; name a coordinate, such as \S+": (
         "nothing drives the mechanism: put a motor on a pin or a slide (Motor, M)"
     ),
@@ -41,30 +41,30 @@ WORDS: Mapping[str, str] = {
     r", [^,]* of the scene's scales, more than drift_tol=[\d.e+-]*": "",
     r"with its constraints too far open: .*": "where the loops open: drag a pin (Select, V), so that it moves past",
 }
-SUBJECTS = ("problems", "remarks", "cause", "conflict", "motion", "why", "title")  # keys of answers with sentences
-PYTHON = re.compile(r"`|\budk(jax)?\b|\w\(\)|\b\w+=\S|\bdiffrax\b|\btraced\b")
-ASIDE = re.compile(r" \(((?:[^()]|\(\))*)\)")
+SENTENCE_KEYS = ("problems", "remarks", "cause", "conflict", "motion", "why", "title")  # keys of answers with sentences
+PYTHON_WORDING = re.compile(r"`|\budk(jax)?\b|\w\(\)|\b\w+=\S|\bdiffrax\b|\btraced\b")
+PARENTHESIS = re.compile(r" \(((?:[^()]|\(\))*)\)")
 CLAUSE = re.compile(r'((?:"[^"]*"|(?![;:] ).)+)([;:] )?')
 VOCABULARY = re.compile(r'"[^"]*"|\bdriver(s?)\b|\b[Tt]he scene\b')
-UNKNOWN = "this cannot be computed for the drawing as it is: go back to an earlier one (Ctrl+Z)"
+UNKNOWN_CAUSE = "this cannot be computed for the drawing as it is: go back to an earlier one (Ctrl+Z)"
 
 
 def studio_words(message: str) -> str:
     """Return a message of the package in the words of the studio."""
-    for pattern, words in WORDS.items():
+    for pattern, words in STUDIO_WORDS.items():
         message = re.sub(pattern, words, message)
-    if PYTHON.search(message):
-        message = _without_python(message) or UNKNOWN
+    if PYTHON_WORDING.search(message):
+        message = _without_python(message) or UNKNOWN_CAUSE
     return VOCABULARY.sub(_noun, message)
 
 
 def in_studio_words(answer: Any) -> Any:
-    """Return an answer of JSON values in which the sentences, the values of the keys in `SUBJECTS`, are in the studio's words."""
+    """Return an answer of JSON values whose sentences, the values of `SENTENCE_KEYS`, are in the studio's words."""
     if isinstance(answer, list):
         return [in_studio_words(x) for x in answer]
     if not isinstance(answer, dict):
         return answer
-    return {key: _said(x) if key in SUBJECTS else in_studio_words(x) for key, x in answer.items()}
+    return {key: _said(x) if key in SENTENCE_KEYS else in_studio_words(x) for key, x in answer.items()}
 
 
 def _said(given: Any) -> Any:
@@ -74,8 +74,8 @@ def _said(given: Any) -> Any:
 
 
 def _without_python(message: str) -> str:
-    message = ASIDE.sub(lambda found: "" if PYTHON.search(found[1]) else found[0], message)
-    kept = [clause for clause in CLAUSE.findall(message) if not PYTHON.search(clause[0])]
+    message = PARENTHESIS.sub(lambda found: "" if PYTHON_WORDING.search(found[1]) else found[0], message)
+    kept = [clause for clause in CLAUSE.findall(message) if not PYTHON_WORDING.search(clause[0])]
     return "".join(words + mark for words, mark in kept).rstrip(":; ")
 
 

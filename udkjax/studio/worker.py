@@ -17,7 +17,7 @@ from typing import Any
 
 from udkjax.studio.limits import RefusedError
 
-TASKS = "udkjax.studio.tasks"
+TASKS_MODULE = "udkjax.studio.tasks"
 END_SECONDS = 5.0  # time to wait for a killed process
 
 
@@ -112,7 +112,7 @@ def _serve(connection: Connection, folder: Path | None) -> None:
     """Answer requests, each with the name and the arguments of a task, until the connection is closed."""
     if folder is not None:
         os.chdir(folder)
-    tasks = import_module(TASKS)
+    tasks = import_module(TASKS_MODULE)
     while True:
         try:
             request = json.loads(connection.recv_bytes())

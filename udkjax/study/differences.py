@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int
 
 STEP_RATIO = 4.0  # ratio of successive steps of differences
 DIFFERENCE_STEPS = 0.1 * STEP_RATIO ** -np.arange(10.0)  # changes of dimensionless unknowns, from 0.1 to 4e-7
-RICHARDSON = STEP_RATIO**2  # ratio of the errors of successive steps, which are of second order
+ERROR_RATIO = STEP_RATIO**2  # ratio of the errors of successive steps, which are of second order
 NEXT_STEPS = 2  # number of smaller steps to compare a step with; a single one may agree by chance
 LEAST_CHANGE = 1e-2  # a step is small if values change by less than this, relative to their size
 TOO_LARGE = 0.5  # a step is too large if smaller steps disagree by more than this, relative to the difference
@@ -83,7 +83,7 @@ class DifferenceSums:
         derivative = np.zeros(len(series)) if derivative is None else derivative
         rows = np.arange(len(series)) if rows is None else rows
         D = (y[:, 0] - y[:, 1]) / (2 * self._steps[:, None])
-        R = (RICHARDSON * D[1:] - D[:-1]) / (RICHARDSON - 1)
+        R = (ERROR_RATIO * D[1:] - D[:-1]) / (ERROR_RATIO - 1)
         members = {s: np.flatnonzero(series == s) for s in np.unique(series).tolist()}
         self._rows += np.bincount(series, minlength=len(self._rows))
         self._derivative += squares(derivative)
@@ -118,7 +118,7 @@ class DifferenceSums:
         size = np.stack([distances[k, k] for k in range(len(distances))])
         # Errors do not decrease with the step size; smaller values at large steps are chance.
         off = np.fmax.accumulate(jumps[::-1])[::-1] / h
-        noise = np.where(np.isfinite(size), (RICHARDSON * off[1:] + off[:-1]) / (RICHARDSON - 1), np.nan)
+        noise = np.where(np.isfinite(size), (ERROR_RATIO * off[1:] + off[:-1]) / (ERROR_RATIO - 1), np.nan)
         return Differences(
             self._steps[:-2],
             size[:-1],

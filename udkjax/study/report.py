@@ -10,7 +10,7 @@ import numpy as np
 from udkjax.scene.mechanism import Mechanism
 
 MOST_DIGITS = 12  # largest number of digits in a table
-_ROWS = {"Revolute": ("x", "y"), "Weld": ("x", "y", "angle"), "Prismatic": ("across", "angle")}
+_ROW_NAMES = {"Revolute": ("x", "y"), "Weld": ("x", "y", "angle"), "Prismatic": ("across", "angle")}
 
 
 def ratio(values: Sequence[float] | np.ndarray) -> str:
@@ -29,7 +29,7 @@ def format_value(value: float, error: float) -> str:
 def row_label(mechanism: Mechanism, constraint: str, row: int) -> str:
     """Return the name of one row of a constraint, such as `B2 (y)`."""
     kind = type(mechanism.constraints[constraint]).__name__
-    return f"{constraint} ({_ROWS[kind][row] if kind in _ROWS else f'row {row + 1}'})"
+    return f"{constraint} ({_ROW_NAMES[kind][row] if kind in _ROW_NAMES else f'row {row + 1}'})"
 
 
 def plain(value: object) -> Any:

@@ -22,10 +22,10 @@ from udkjax.synthesis.goals import CombinedResiduals, Goal, check_place, place_o
 BLUR = OF_FINISH[0][0]
 # Points of the curve for each position. With one, the loss of a good fit misses what lies between, up to two thirds of it; with
 # two it is within 15 % of that with eight.
-FINENESS = 2
+POINTS_PER_POSITION = 2
 # Smallest second derivative of a position in steps, relative to their mean. Positions that coincide have no share in the curve's
-# length, and none in the loss; gradients are exact with any value, and steps at most 1 / sqrt(SOFT) times longer than usual.
-SOFT = 1e-2
+# length, and none in the loss; gradients are exact with any value, and steps at most 1 / sqrt(SOFTENING) times longer than usual.
+SOFTENING = 1e-2
 
 
 class CurveGoal(Goal):
@@ -63,7 +63,7 @@ class CurveGoal(Goal):
         self.pin, self.part, self.samples, self.start, self.line = pin, part, samples, "free", ()
         self.points = np.asarray(points, float)
         self.is_whole, self.scale, self._middle = wanted.is_whole, wanted.scale, wanted.middle
-        self._target = wanted.target(FINENESS * samples)
+        self._target = wanted.target(POINTS_PER_POSITION * samples)
         order = wanted.points
         if wanted.is_whole and not wanted.is_closed:  # forth and back
             order = np.concatenate([order, order[-2::-1]])
@@ -109,7 +109,7 @@ class CurveGoal(Goal):
         """
         found = self._compare(r)
         xx, xy, yy = found.moments
-        soft = SOFT * 0.5 * (xx + yy).mean(1, keepdims=True)
+        soft = SOFTENING * 0.5 * (xx + yy).mean(1, keepdims=True)
         a = np.sqrt(xx + soft)
         b = xy / a
         c = np.sqrt(yy + soft - b * b)
@@ -127,7 +127,7 @@ class CurveGoal(Goal):
     def report(self, r: np.ndarray) -> np.ndarray:
         """Return the roots (J, 2) of the parts of the loss: those of the J positions, and those of J pieces of the curve."""
         found = self._compare(r[None])
-        of_curve = found.of_target[0].reshape(self.samples, FINENESS).sum(1)
+        of_curve = found.of_target[0].reshape(self.samples, POINTS_PER_POSITION).sum(1)
         return self.scale * np.sqrt(np.stack([found.of_curve[0], of_curve], 1))
 
     def distances(self, residuals: np.ndarray) -> np.ndarray:

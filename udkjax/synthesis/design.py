@@ -28,10 +28,10 @@ from udkjax.synthesis.search import SearchState, begin, improve, raise_weights
 from udkjax.synthesis.selection import POLISH_STEPS, select
 from udkjax.synthesis.starts import find_starts
 
-SAMPLES = 8  # number of random mechanisms per start; the best one is used
+SAMPLES_PER_START = 8  # number of random mechanisms per start; the best one is used
 # Steps of each stage, and the fraction of trials that continue afterwards; the others are unlikely to succeed.
 STAGES = ((15, 0.4), (30, 0.4), (100, 0.3))
-FEWEST = 16  # smallest number of trials that continue; also the number of polished trials
+FEWEST_TRIALS = 16  # smallest number of trials that continue; also the number of polished trials
 
 
 class DesignSearch:
@@ -116,7 +116,7 @@ class DesignSearch:
             require_count(name, value)
         require_count("seed", seed, 0)
         problem = self.problem
-        trials = find_starts(problem, starts, SAMPLES * starts, np.random.default_rng(int(seed)), threads)
+        trials = find_starts(problem, starts, SAMPLES_PER_START * starts, np.random.default_rng(int(seed)), threads)
         if not len(trials.x):
             what = "makes a whole turn" if problem.rotation else "has all positions of the goal"
             reason = f"no random mechanism within the bounds {what}: change the bounds or the structure"
@@ -130,13 +130,13 @@ def search(problem: DesignProblem, state: SearchState, threads: int | None) -> S
     """Return the final state of a search: from stage to stage fewer trials, the best, are improved; the last are polished."""
     shares = [share for _, share in STAGES]
     for share, (steps, _) in zip(shares, STAGES[1:], strict=False):
-        count = max(FEWEST, int(share * len(state.merit)))
+        count = max(FEWEST_TRIALS, int(share * len(state.merit)))
         merit = np.where(state.found.exists, state.merit, np.inf)
         state = state.take(np.argsort(merit, kind="stable")[:count])
         raise_weights(problem, state)
         state = improve(problem, state, steps, threads)
     merit = np.where(state.found.exists, state.merit, np.inf)
-    return polish(problem, state.take(np.argsort(merit, kind="stable")[:FEWEST]), POLISH_STEPS, threads)
+    return polish(problem, state.take(np.argsort(merit, kind="stable")[:FEWEST_TRIALS]), POLISH_STEPS, threads)
 
 
 @checked

@@ -18,7 +18,7 @@ from udkjax.scene.tables.checks import SceneError
 from udkjax.synthesis.curves.found_mechanism import FoundMechanism
 from udkjax.synthesis.design_problem import DesignProblem
 
-AGREEMENT = 1e-6  # tolerance between the losses of search and motion, relative to the loss and to the squared scale
+LOSS_TOL = 1e-6  # tolerance between the losses of search and motion, relative to the loss and to the squared scale
 
 
 class FoundDesign(FoundMechanism):
@@ -127,7 +127,7 @@ def verified(problem: DesignProblem, x: np.ndarray, s: np.ndarray, q: np.ndarray
     residuals = problem.residuals(unknowns, moved.reshape(len(s), -1))
     of_terms = [term.residual(m) for term, m in zip(problem.terms, measures, strict=True)]
     loss_of_motion = float(sum(np.sum(r**2) for r in (residuals, *of_terms)))
-    if not abs(loss_of_motion - loss) <= AGREEMENT * (loss + AGREEMENT * problem.scale**2):
+    if not abs(loss_of_motion - loss) <= LOSS_TOL * (loss + LOSS_TOL * problem.scale**2):
         return None
     tau = problem.transmission_at(x, s, q)
     parameters = dict(zip(numbers.names, numbers.values, strict=True))

@@ -15,7 +15,7 @@ from udkjax.synthesis.goals import FunctionGoal, Goal, PoseGoal
 
 # Deviation relative to the extent of the targets beyond which a design is no fit: its motion looks like another one. The word is
 # for people: no computation depends on it, and a curve of another form misses its targets by about this much.
-MOST = 0.1
+LARGEST_DEVIATION = 0.1
 
 
 class Deviation(NamedTuple):
@@ -38,7 +38,7 @@ class Deviation(NamedTuple):
     @property
     def is_fit(self) -> bool:
         """True if the deviation is at most a tenth of the extent of the targets; for an angle, a tenth of a radian."""
-        return self.largest <= MOST * self.size and (self.angle is None or self.angle <= MOST)
+        return self.largest <= LARGEST_DEVIATION * self.size and (self.angle is None or self.angle <= LARGEST_DEVIATION)
 
     def words(self, units: Units) -> str:
         """Return the deviation as text: `at most 0.4 mm off on a path of 170 mm`."""

@@ -23,7 +23,7 @@ from udkjax.synthesis.motion_goals import EnergyGoal, FrequencyGoal, GapGoal, Lo
 from udkjax.synthesis.robust_goal import RobustGoal
 from udkjax.wording import plural, quote, unknown_key
 
-TOP = (
+TOP_KEYS = (
     "mechanism",
     "units",
     "goal",
@@ -37,10 +37,10 @@ TOP = (
     "transmission",
     "rotation",
 )
-SEARCHED = ("free", "motion")  # settings that a search for all solutions does not have
-LENGTH = ("pins", "least", "most")
+SEARCH_SETTINGS = ("free", "motion")  # settings that a search for all solutions does not have
+LENGTH_KEYS = ("pins", "least", "most")
 # The keys of each kind of goal, and their SI units; "value" is the unit of the driver.
-GOALS: dict[str, tuple[Callable[..., Goal], dict[str, str]]] = {
+GOAL_KINDS: dict[str, tuple[Callable[..., Goal], dict[str, str]]] = {
     "path": (PathGoal, {"point": "", "targets": "m", "values": "value", "start": "", "line": "", "at": "m"}),
     "poses": (
         PoseGoal,
@@ -53,9 +53,9 @@ GOALS: dict[str, tuple[Callable[..., Goal], dict[str, str]]] = {
     "curve": (CurveGoal, {"pin": "", "points": "m", "part": "", "samples": ""}),
 }
 # Columns of a table of targets: x, y; x, y, angle; value of the driver, output.
-COLUMNS = {"path": 2, "poses": 3, "function": 2}
+TARGET_COLUMNS = {"path": 2, "poses": 3, "function": 2}
 # The kinds of motion goals, each with the unit of its measure; "effort" is the unit of the driver's effort. Below: further keys.
-MOTION: dict[str, tuple[Callable[..., MotionTerm], str]] = {
+MOTION_KINDS: dict[str, tuple[Callable[..., MotionTerm], str]] = {
     "torque": (TorqueGoal, "effort"),
     "load": (LoadGoal, "N"),
     "energy": (EnergyGoal, "J"),
@@ -64,7 +64,7 @@ MOTION: dict[str, tuple[Callable[..., MotionTerm], str]] = {
     "gap": (GapGoal, "m"),
 }
 MOTION_KEYS = ("kind", "most", "least", "speed", "weight", "samples")
-KINDS = (*MOTION, "robust")
+MOTION_GOAL_NAMES = (*MOTION_KINDS, "robust")
 ROBUST_KEYS = ("kind", "goal", "tolerances", "sigmas", "most", "weight")
 OWN_KEYS = {"load": ("joint",), "tolerance": ("point", "tolerances"), "gap": ("one", "other")}
 
@@ -81,7 +81,7 @@ def read_design(path: str | os.PathLike[str]) -> DesignSearch | CompleteSearch:
     """
     name = os.fspath(path)
     table = parse_toml(Path(path).read_text(encoding="utf-8"), name, SceneError)
-    problems = [f"{key}: {unknown_key(key, TOP)}" for key in table if key not in TOP]
+    problems = [f"{key}: {unknown_key(key, TOP_KEYS)}" for key in table if key not in TOP_KEYS]
     problems += [f"{key} is missing" for key in ("mechanism", "goal") if key not in table]
     units = Units(table.get("units"))
     problems += units.problems
@@ -90,7 +90,9 @@ def read_design(path: str | os.PathLike[str]) -> DesignSearch | CompleteSearch:
         problems.append("complete must be true or false")
     elif complete:
         problems += [
-            f"{key} is given with complete = true, which finds all solutions: leave it out" for key in SEARCHED if key in table
+            f"{key} is given with complete = true, which finds all solutions: leave it out"
+            for key in SEARCH_SETTINGS
+            if key in table
         ]
     if problems:
         raise SceneError(problems, name)
@@ -132,9 +134,9 @@ def _with_table(goal: Any, folder: Path, problems: list[str]) -> Any:
             return {**goal, "points": read_curve_file(folder / goal["points"]).tolist()}
         except ValueError as problem:
             problems.append(f"goal.points: {problem}")
-    if not isinstance(goal, Mapping) or not isinstance(goal.get("targets"), str) or goal.get("kind") not in COLUMNS:
+    if not isinstance(goal, Mapping) or not isinstance(goal.get("targets"), str) or goal.get("kind") not in TARGET_COLUMNS:
         return goal
-    file, columns, rows = folder / goal["targets"], COLUMNS[goal["kind"]], []
+    file, columns, rows = folder / goal["targets"], TARGET_COLUMNS[goal["kind"]], []
     for k, row in enumerate(csv.reader(io.StringIO(file.read_text(encoding="utf-8-sig")))):
         try:
             numbers = [float(x) for x in row[:columns]]
@@ -151,10 +153,10 @@ def _with_table(goal: Any, folder: Path, problems: list[str]) -> Any:
 
 def _read_goal(mechanism: Mechanism, table: Any, units: Units, problems: list[str]) -> Goal | None:
     kind = table.get("kind") if isinstance(table, Mapping) else None
-    if kind not in GOALS:
-        problems.append(f"goal.kind must be one of {', '.join(map(quote, GOALS))}, not {quote(str(kind))}")
+    if kind not in GOAL_KINDS:
+        problems.append(f"goal.kind must be one of {', '.join(map(quote, GOAL_KINDS))}, not {quote(str(kind))}")
         return None
-    make, keys = GOALS[kind]
+    make, keys = GOAL_KINDS[kind]
     before = len(problems)
     problems += [f"goal.{key}: {unknown_key(key, keys)}" for key in table if key not in (*keys, "kind")]
     given = {key: value for key, value in table.items() if key in keys}
@@ -180,10 +182,10 @@ def _read_motion(
     kind = table.get("kind") if isinstance(table, Mapping) else None
     if kind == "robust":
         return _read_robust(where, mechanism, goal, table, units, problems)
-    if kind not in MOTION:
-        problems.append(f"{where}.kind must be one of {', '.join(map(quote, (*MOTION, 'robust')))}, not {quote(str(kind))}")
+    if kind not in MOTION_KINDS:
+        problems.append(f"{where}.kind must be one of {', '.join(map(quote, (*MOTION_KINDS, 'robust')))}, not {quote(str(kind))}")
         return None
-    make, unit = MOTION[kind]
+    make, unit = MOTION_KINDS[kind]
     keys, before = (*MOTION_KEYS, *OWN_KEYS.get(kind, ())), len(problems)
     problems += [f"{where}.{key}: {unknown_key(key, keys)}" for key in table if key not in keys]
     given, driven = {key: value for key, value in table.items() if key != "kind"}, _driven_unit(mechanism)
@@ -270,7 +272,7 @@ def _read_lengths(tables: Any, units: Units, problems: list[str]) -> dict[tuple[
     ranges = {}
     for k, table in enumerate(tables):
         where = f"length[{k}]"
-        problems += [f"{where}.{key}: {unknown_key(key, LENGTH)}" for key in table if key not in LENGTH]
+        problems += [f"{where}.{key}: {unknown_key(key, LENGTH_KEYS)}" for key in table if key not in LENGTH_KEYS]
         pins = table.get("pins")
         if not isinstance(pins, list) or len(pins) != 2:
             problems.append(f'{where}.pins: must name two pins, such as ["A", "B"]')

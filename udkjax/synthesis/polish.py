@@ -9,14 +9,14 @@ computed by differences of gradients, evaluated in one batch. Steps go downhill 
 import numpy as np
 
 from udkjax.synthesis.design_problem import DesignProblem
-from udkjax.synthesis.search import ROUNDING, SearchState, harden, merit_of, must_continue
+from udkjax.synthesis.search import ROUNDING_LOSS, SearchState, harden, merit_of, must_continue
 from udkjax.synthesis.steps import ACTIVE_SETS
 from udkjax.synthesis.trials import TrialResiduals, Trials
 
 # Relative to the scales; small enough for mechanisms that barely turn. Rounding errors of the Hessian are about 1e-8.
-DIFFERENCE = 1e-7
+DIFFERENCE_STEP = 1e-7
 FIRST_SHIFT, LEAST_SHIFT, MOST_SHIFT = 1e-3, 1e-14, 1e6  # mu, relative to the largest eigenvalue
-CONVERGED = 1e-13  # predicted relative decrease of the merit
+CONVERGED_DECREASE = 1e-13  # predicted relative decrease of the merit
 
 
 def polish(problem: DesignProblem, state: SearchState, steps: int, threads: int | None = None) -> SearchState:
@@ -72,7 +72,7 @@ def _newton_step(
     accepted, rejected = active[better], active[~better]
     state.accept(problem, accepted, new.take(better), trial.take(better), merit[better])
     promised = np.abs(np.einsum("mk,mk->m", g, dz))
-    small = promised <= CONVERGED * state.merit[active] + ROUNDING * problem.scale**2
+    small = promised <= CONVERGED_DECREASE * state.merit[active] + ROUNDING_LOSS * problem.scale**2
     shift[accepted] = np.maximum(0.1 * shift[accepted], LEAST_SHIFT)
     shift[rejected] = shift[rejected] * 10.0
     ended = active[small | (shift[active] > MOST_SHIFT)]
@@ -127,7 +127,7 @@ def _hessian(
     threads: int | None,
 ) -> np.ndarray:
     members, N = z.shape
-    moves = DIFFERENCE * np.concatenate([np.diag(units), -np.diag(units)])  # (2 N, N)
+    moves = DIFFERENCE_STEP * np.concatenate([np.diag(units), -np.diag(units)])  # (2 N, N)
     moved = (z[:, None] + moves).reshape(-1, N)
     repeated = Trials(*(np.repeat(a, 2 * N, 0) for a in trials))
     x = moved[:, : problem.unknowns]
@@ -136,5 +136,5 @@ def _hessian(
     moved_trials = problem.evaluate(split, margin, threads)
     g = _gradient(problem, moved_trials, u, weight, pressed) * units
     g = np.where(moved_trials.exists[:, None], g, np.nan).reshape(members, 2, N, N)
-    H = (g[:, 0] - g[:, 1]) / (2.0 * DIFFERENCE)
+    H = (g[:, 0] - g[:, 1]) / (2.0 * DIFFERENCE_STEP)
     return 0.5 * (H + H.transpose(0, 2, 1))

@@ -15,18 +15,18 @@ from udkjax.synthesis.steps import StepEquations, in_order
 from udkjax.synthesis.trials import TrialResiduals, Trials
 
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-2, 1e-10, 1e8
-RELAX, TIGHTEN = 0.2, 4.0  # factors of the damping after an accepted and a rejected step
+DAMPING_DECREASE, DAMPING_INCREASE = 0.2, 4.0  # factors of the damping after an accepted and a rejected step
 # Weights w of limits relative to residuals. A search begins with a small weight and raises it each time it has converged;
 # the violation decreases with the square of the weight.
-FIRST_WEIGHT, HARDEN, MOST_WEIGHT = 0.5, 6.0, 100.0
-HIGH = 20.0  # unit of weights, relative to the root of the loss over the scale; limits with smaller weights have no effect
+FIRST_WEIGHT, WEIGHT_GROWTH, MOST_WEIGHT = 0.5, 6.0, 100.0
+WEIGHT_UNIT = 20.0  # unit of weights, relative to the root of the loss over the scale; limits with smaller weights have no effect
 # Squared transmissions: the first margin, and the factor by which it shrinks to the requested one whenever a trial has converged.
 FIRST_MARGIN, SHRINK_MARGIN = 1e-3, 0.03
 LIMIT_TOL = 1e-8  # accepted excess over a limit before the last polish, in scales
 LEAST_FALL = 1e-9  # relative decrease of the loss below which a trial has converged
-PRESSED = 1e-5  # relative decrease of the loss below which exceeded limits get a larger weight
-ROUNDING = 1e-26  # losses below this, relative to the squared scale, are rounding errors
-AHEAD = 0.1  # fraction of a step at which residuals are evaluated for their second derivative along it
+SLOW_DECREASE = 1e-5  # relative decrease of the loss below which exceeded limits get a larger weight
+ROUNDING_LOSS = 1e-26  # losses below this, relative to the squared scale, are rounding errors
+AHEAD_FRACTION = 0.1  # fraction of a step at which residuals are evaluated for their second derivative along it
 MOST_BEND = 0.75  # largest 2 |acceleration| / |step|
 
 
@@ -146,13 +146,16 @@ def _step(problem: DesignProblem, state: SearchState, active: np.ndarray, sign: 
     better, fall = merits < old_merit, old_merit - merits
     accepted, rejected = active[better], active[~better]
     state.accept(problem, accepted, new.take(better), trial.take(better), merits[better])
-    slow = fall[better] < PRESSED * old_merit[better]
+    slow = fall[better] < SLOW_DECREASE * old_merit[better]
     settled = fall[better] < LEAST_FALL * old_merit[better]
     settled[slow] |= must_continue(problem, state, accepted[slow])
-    state.damping[accepted] = np.maximum(RELAX * state.damping[accepted], LEAST_DAMPING)
-    state.damping[rejected] *= TIGHTEN
+    state.damping[accepted] = np.maximum(DAMPING_DECREASE * state.damping[accepted], LEAST_DAMPING)
+    state.damping[rejected] *= DAMPING_INCREASE
     done = np.concatenate(
-        [accepted[settled | (merits[better] < ROUNDING * problem.scale**2)], rejected[state.damping[rejected] > MOST_DAMPING]]
+        [
+            accepted[settled | (merits[better] < ROUNDING_LOSS * problem.scale**2)],
+            rejected[state.damping[rejected] > MOST_DAMPING],
+        ]
     )
     _settle(problem, state, done)
 
@@ -169,12 +172,16 @@ def _bent_step(problem: DesignProblem, equations: StepEquations, threads: int | 
         return dx, ds
     ds = in_order(problem, ds, equations.trials.s)
     trials, found = equations.trials, equations.found
-    r, limits, exists = problem.residuals_at(Trials(trials.x + AHEAD * dx, trials.s + AHEAD * ds, trials.q), threads)
+    r, limits, exists = problem.residuals_at(
+        Trials(trials.x + AHEAD_FRACTION * dx, trials.s + AHEAD_FRACTION * ds, trials.q), threads
+    )
     first_order = np.einsum("mjgp,mp->mjg", found.by_unknowns, dx) + found.by_value * ds[..., None]
-    bend_of_r = ((r - found.r) / AHEAD - first_order) / AHEAD
+    bend_of_r = ((r - found.r) / AHEAD_FRACTION - first_order) / AHEAD_FRACTION
     bend_of_limits, count = np.zeros_like(found.limits), limits.shape[1]
     slopes = found.limits_by_unknowns[:, :count]
-    bend_of_limits[:, :count] = ((limits - found.limits[:, :count]) / AHEAD - (slopes @ dx[..., None])[..., 0]) / AHEAD
+    bend_of_limits[:, :count] = (
+        (limits - found.limits[:, :count]) / AHEAD_FRACTION - (slopes @ dx[..., None])[..., 0]
+    ) / AHEAD_FRACTION
     bend_of_r[~exists] = 0.0
     ddx, dds = equations.correct(bend_of_r, bend_of_limits)
     ratio = 2.0 * equations.length(ddx) / np.maximum(equations.length(dx), 1e-300)
@@ -207,7 +214,7 @@ def harden(problem: DesignProblem, state: SearchState, which: np.ndarray):
     unit = MARGIN_WEIGHT * problem.scale
     state.found.limits[which, problem.lengths.count :] += unit * (margin - state.margin[which])[:, None]
     state.margin[which] = margin
-    _reweigh(problem, state, which, np.maximum(weight, np.minimum(HARDEN * weight, largest)))
+    _reweigh(problem, state, which, np.maximum(weight, np.minimum(WEIGHT_GROWTH * weight, largest)))
 
 
 def raise_weights(problem: DesignProblem, state: SearchState):
@@ -218,7 +225,7 @@ def raise_weights(problem: DesignProblem, state: SearchState):
 
 def _height(problem: DesignProblem, state: SearchState, which: np.ndarray) -> np.ndarray:
     """Return the unit of the weights of the trials `which`, at least 1 and proportional to the root of large losses."""
-    return np.maximum(1.0, HIGH / problem.scale * np.sqrt(loss_of(state.found.take(which))))
+    return np.maximum(1.0, WEIGHT_UNIT / problem.scale * np.sqrt(loss_of(state.found.take(which))))
 
 
 def _reweigh(problem: DesignProblem, state: SearchState, which: np.ndarray, weight: np.ndarray):

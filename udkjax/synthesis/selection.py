@@ -15,10 +15,10 @@ from udkjax.synthesis.search import LIMIT_TOL, SearchState, begin, improve, loss
 from udkjax.synthesis.trials import Trials
 
 POLISH_STEPS = 40  # largest number of Newton steps; about five are usual at each weight of the limits
-ALIKE = 1e-3  # mechanisms whose pins differ by less, in scales, are the same
+SAME_MECHANISM_TOL = 1e-3  # mechanisms whose pins differ by less, in scales, are the same
 STRICTER_MARGINS = (0.01, 0.03, 0.1)  # limits of transmission (sines) with which refused trials are improved again, in turn
 MARGIN_STEPS = 40  # steps with each of these limits
-REFUSALS = 3  # refusals before all are improved again; to verify a motion takes longer than to improve sixteen trials
+MOST_REFUSALS = 3  # refusals before all are improved again; to verify a motion takes longer than to improve sixteen trials
 
 
 class _Candidates(NamedTuple):
@@ -44,7 +44,7 @@ def select(problem: DesignProblem, state: SearchState, results: int, threads: in
         return Selection([], losses, _exceeded_limit(problem, state))
     found: list[tuple[FoundDesign, np.ndarray]] = []
     for least in (*STRICTER_MARGINS, None):
-        open_ones = _verify(problem, candidates, results, found, len(candidates.loss) if least is None else REFUSALS)
+        open_ones = _verify(problem, candidates, results, found, len(candidates.loss) if least is None else MOST_REFUSALS)
         if least is None or not len(open_ones):
             break
         state = begin(problem, candidates.trials.take(open_ones), threads, least)
@@ -53,7 +53,7 @@ def select(problem: DesignProblem, state: SearchState, results: int, threads: in
         )
     if found and len(found) < results:  # add worse designs
         worse = np.flatnonzero(losses > found[0][0].loss)
-        _verify(problem, _Candidates(first.trials.take(worse), losses[worse]), results, found, REFUSALS)
+        _verify(problem, _Candidates(first.trials.take(worse), losses[worse]), results, found, MOST_REFUSALS)
     reason = "the motions of all trials within the limits leave their branches or reach dead points"
     return Selection([design for design, _ in found], losses, "" if found else f"{reason}: raise `transmission`")
 
@@ -83,7 +83,7 @@ def _verify(
         x, s, q = (a[k] for a in candidates.trials)
         signature = np.append(problem.signature(x, q[0]), 0.0)
         known = [*refused, *(earlier for _, earlier in found)]
-        if any(np.max(np.abs(signature - earlier)) < ALIKE * problem.scale for earlier in known):
+        if any(np.max(np.abs(signature - earlier)) < SAME_MECHANISM_TOL * problem.scale for earlier in known):
             continue
         design = verified(problem, x, s, q, float(loss))
         if design is None:
@@ -93,7 +93,7 @@ def _verify(
             found.sort(key=lambda pair: pair[0].loss)
     del found[results:]
     best = found[0][0].loss if found else np.inf
-    return np.flatnonzero(candidates.loss < best * (1.0 - ALIKE)) if refused else np.zeros(0, int)
+    return np.flatnonzero(candidates.loss < best * (1.0 - SAME_MECHANISM_TOL)) if refused else np.zeros(0, int)
 
 
 def _exceeded_limit(problem: DesignProblem, state: SearchState) -> str:

@@ -12,11 +12,11 @@ import numpy as np
 from udkjax.synthesis.design_problem import TURN_VALUES, DesignProblem
 from udkjax.synthesis.trials import Trials, Turn
 
-PHASES = 12  # number of first values tried, evenly over a turn
-SPANS = (1.0, 0.6, 0.3)  # fractions of a turn from the first value to the last, tried for open curves
+FIRST_VALUES = 12  # number of first values tried, evenly over a turn
+TURN_SPANS = (1.0, 0.6, 0.3)  # fractions of a turn from the first value to the last, tried for open curves
 LEAST_SCALE = 0.03  # smallest factor of scaling, since a curve that fits best as a point does not fit at all
-ROUNDS = 2  # number of times that curves are moved to the targets and values assigned
-CLEAR = 0.02  # smallest transmission over the turn; mechanisms closer to a meeting of branches soon reach it
+ASSIGNING_ROUNDS = 2  # number of times that curves are moved to the targets and values assigned
+LEAST_TRANSMISSION = 0.02  # smallest transmission over the turn; mechanisms closer to a meeting of branches soon reach it
 
 
 class _Fitted(NamedTuple):
@@ -31,7 +31,7 @@ def find_starts(problem: DesignProblem, count: int, samples: int, rng: np.random
     x = np.zeros((samples, problem.unknowns))
     x[:, : problem.free.count] = rng.uniform(problem.first, problem.last, (samples, problem.free.count))
     turn = problem.turn(x, TURN_VALUES, threads)
-    reached = turn.reached.all(1) & (np.abs(turn.transmission).min(1) > CLEAR)
+    reached = turn.reached.all(1) & (np.abs(turn.transmission).min(1) > LEAST_TRANSMISSION)
     in_order = problem.local or problem.goal.is_combined
     if problem.rotation or in_order:
         x, turn = x[reached], Turn(*(a[reached] for a in turn))
@@ -55,7 +55,7 @@ def _assign(problem: DesignProblem, x: np.ndarray, turn: Turn) -> tuple[tuple[np
     curve = turn.measures[:, :-1, 0] + 1j * turn.measures[:, :-1, 1]
     moves = problem.can_move
     fitted = _best_phase(curve, target, moves, problem.is_closed)
-    for _ in range(ROUNDS):
+    for _ in range(ASSIGNING_ROUNDS):
         a, b, _ = _move(np.take_along_axis(curve, fitted.places % TURN_VALUES, 1), target, moves)
         fitted = _in_order(a[:, None] * curve + b[:, None], target, fitted.places)
     a, b, cost = _move(np.take_along_axis(curve, fitted.places % TURN_VALUES, 1), target, moves)
@@ -66,12 +66,12 @@ def _assign(problem: DesignProblem, x: np.ndarray, turn: Turn) -> tuple[tuple[np
 def _best_phase(curve: np.ndarray, target: np.ndarray, moves: str, closed: bool) -> _Fitted:
     """Return the best assignment of evenly spaced values to the targets, of several first values, spans and both directions."""
     J, K = len(target), curve.shape[1]
-    spans = (1.0,) if closed else SPANS
+    spans = (1.0,) if closed else TURN_SPANS
     best = _Fitted(np.zeros((len(curve), J), int), np.full(len(curve), np.inf))
     for span in spans:
         for direction in (1, -1):
             even = direction * np.round(span * K * np.arange(J) / max(J - 1, 1)).astype(int)
-            for phase in range(0, K, K // PHASES):
+            for phase in range(0, K, K // FIRST_VALUES):
                 places = np.broadcast_to(phase + even, (len(curve), J))
                 cost = _move(curve[:, (phase + even) % K], target, moves)[2]
                 better = cost < best.cost

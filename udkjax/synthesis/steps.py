@@ -18,7 +18,7 @@ from udkjax.synthesis.trials import TrialResiduals, Trials
 LONGEST_MOVE = 0.5  # largest change of an unknown in one step, relative to its scale
 ACTIVE_SETS = 5  # largest number of iterations to determine the active limits of a step
 GAP_SHARE = 0.45  # largest change of a value in one step, relative to the gap to its neighbours; keeps values in order
-REGULAR = float(np.finfo(float).eps)  # regularization, relative to the largest diagonal entry
+REGULARIZATION = float(np.finfo(float).eps)  # regularization, relative to the largest diagonal entry
 
 
 class StepEquations:
@@ -53,7 +53,7 @@ class StepEquations:
         if problem.local:
             self.w = np.einsum("mjg,mjgp->mjp", found.by_value, found.by_unknowns)
             h = np.einsum("mjg,mjg->mj", found.by_value, found.by_value)
-            self.h = h * (1.0 + damping[:, None]) + REGULAR * problem.scale**2
+            self.h = h * (1.0 + damping[:, None]) + REGULARIZATION * problem.scale**2
             self.A = self.A - (self.w / self.h[..., None]).transpose(0, 2, 1) @ self.w
 
     def find(self) -> tuple[np.ndarray, np.ndarray]:
@@ -73,7 +73,7 @@ class StepEquations:
             gradient = b[which] + ((force * excess)[:, None] @ C)[:, 0]
             size = self.diagonal[which] + (force[:, None] @ C**2)[:, 0]
             steepest = np.max(size, axis=1, keepdims=True)
-            matrix[:, places, places] += self.damping[which, None] * size + REGULAR * (steepest + (steepest == 0))
+            matrix[:, places, places] += self.damping[which, None] * size + REGULARIZATION * (steepest + (steepest == 0))
             held = (low[which] & (gradient > 0)) | (high[which] & (gradient < 0))
             matrix = _held_out(matrix, held)
             change = -solve_each(matrix, np.where(held, 0.0, gradient))

@@ -54,7 +54,7 @@ def test_also_from_a_singular_configuration_that_is_passed(velocity):
     assert found.sum() == rank == 11
 
 
-@pytest.mark.parametrize("angle", [-row_marks.ASIDE.length, 0.0003])
+@pytest.mark.parametrize("angle", [-row_marks.STEP_ASIDE.length, 0.0003])
 def test_also_if_the_step_leads_to_a_singular_configuration_or_begins_near_one(angle):
     found, rank = marks(udk.library.parallelogram(angle=angle))
     assert found.sum() == rank == 11
@@ -74,7 +74,7 @@ def other_step(request, monkeypatch):
         loaded_code.machine_code.cache_clear()
 
     forget()
-    monkeypatch.setattr(row_marks, "ASIDE", row_marks.ASIDE._replace(length=request.param))
+    monkeypatch.setattr(row_marks, "STEP_ASIDE", row_marks.STEP_ASIDE._replace(length=request.param))
     yield
     forget()
 

@@ -16,7 +16,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 import udkjax as udk
 from tests.command_line import udkjax
 from tests.integrate.portable.test_export_c import DRAWINGS, fused, scene
-from udkjax.integrate.portable.fmi.compilers import SUFFIXES, this_platform
+from udkjax.integrate.portable.fmi.compilers import LIBRARY_SUFFIXES, this_platform
 from udkjax.integrate.portable.fmi.description import base_unit
 from udkjax.integrate.portable.fmi.variables import MeasuredState
 from udkjax.positions.assembling.channel_values import measure
@@ -47,7 +47,7 @@ class Instance:
         self.xml = ET.parse(folder / "modelDescription.xml").getroot()
         self.references = {x.get("name"): int(x.get("valueReference", "")) for x in self.xml.iter("Float64")}
         identifier = next(self.xml.iter("CoSimulation")).get("modelIdentifier")
-        suffix = SUFFIXES[this_platform().rpartition("-")[2]]
+        suffix = LIBRARY_SUFFIXES[this_platform().rpartition("-")[2]]
         self.library = ctypes.CDLL(str(folder / "binaries" / this_platform() / f"{identifier}{suffix}"))
         self.messages: list[str] = []
         self._log = LOG(lambda environment, status, category, text: self.messages.append(text.decode()))

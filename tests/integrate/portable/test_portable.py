@@ -117,11 +117,11 @@ def test_accelerations_energies_and_efforts_are_those_of_the_textbook(evaluated,
 
 
 def test_a_pull_is_a_spring_to_a_place_and_a_damper():
-    from udkjax.integrate.portable.pull import PREFIX, Pull, with_pulls
+    from udkjax.integrate.portable.pull import PULL_PREFIX, Pull, with_pulls
 
     mechanism = udk.Mechanism({"ball": udk.Body(mass=2.0, inertia=1.0)}, gravity=(0.0, 0.0))
     held = with_pulls(mechanism).with_parameters(
-        {f"force.{PREFIX}ball.{k}": x for k, x in {"stiffness": 8.0, "damping": 1.0, "target": [1.0, 0.0]}.items()}
+        {f"force.{PULL_PREFIX}ball.{k}": x for k, x in {"stiffness": 8.0, "damping": 1.0, "target": [1.0, 0.0]}.items()}
     )
     ts = np.linspace(0.0, 3.0, 7)
     rate, decay = np.sqrt(8.0 / 2.0 - (1.0 / 4.0) ** 2), 1.0 / 4.0  # of x'' + x'/2 + 4 (x - 1) = 0

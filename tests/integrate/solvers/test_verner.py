@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import udkjax as udk
-from udkjax.integrate.solvers.verner import DENSE, TABLEAU
+from udkjax.integrate.solvers.verner import DENSE_WEIGHTS, TABLEAU
 
 STAGES = len(TABLEAU.b_sol)
 A = np.vstack([np.zeros(STAGES)] + [np.pad(row, (0, STAGES - len(row))) for row in TABLEAU.a_lower])
@@ -67,14 +67,14 @@ def test_nodes():
 
 
 def test_dense_output():
-    powers = np.arange(1, DENSE.shape[1] + 1)
+    powers = np.arange(1, DENSE_WEIGHTS.shape[1] + 1)
     for s in np.linspace(0.0, 1.0, 11):
-        b = DENSE @ s**powers
+        b = DENSE_WEIGHTS @ s**powers
         for n in range(1, 5):
             np.testing.assert_allclose(residuals(b, n, s), 0, atol=3e-15)
         assert np.linalg.norm(residuals(b, 5, s)) < 1e-3  # what is left of order 5 is small
-    np.testing.assert_allclose(DENSE.sum(axis=1), TABLEAU.b_sol, atol=3e-15)
-    np.testing.assert_array_equal(DENSE[:, 0], np.eye(STAGES)[0])
+    np.testing.assert_allclose(DENSE_WEIGHTS.sum(axis=1), TABLEAU.b_sol, atol=3e-15)
+    np.testing.assert_array_equal(DENSE_WEIGHTS[:, 0], np.eye(STAGES)[0])
 
 
 @pytest.fixture(scope="module")

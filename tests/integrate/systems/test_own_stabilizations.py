@@ -13,7 +13,7 @@ import udkjax as udk
 from experiments.parts.atlas_own import BraunGoldfarb
 from tests.integrate.systems.own_systems import G, pendulum
 from tests.integrate.systems.test_own_methods import BenIsrael
-from udkjax.native.lowering.lowering import APART
+from udkjax.native.lowering.lowering import SEPARATE_FUNCTION_SIZE
 from udkjax.native.lowering.module_calls import ModuleCall, call_p, simplified
 
 RATE = np.sqrt(G / 0.6)  # of the conical pendulum 0.6 m below its pivot
@@ -57,7 +57,7 @@ class LongNewton(udk.Stabilization):
 
     def end_of_step(self, at):
         def step(_, at):
-            for _ in range(APART):
+            for _ in range(SEPARATE_FUNCTION_SIZE):
                 at = at.moved(at.q * 1.0, at.v)
             return at.moved(at.q - at.change_of_positions(at.psi), at.v)
 

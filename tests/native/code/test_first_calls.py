@@ -75,6 +75,6 @@ def test_what_is_called_often_is_optimized(calls, monkeypatch):
 
 def test_optimized_code_on_disk_is_taken(calls):
     text = "define void @run(ptr %x) {\n  ret void\n}\ndefine void @call_frame(ptr %x) {\n  ret void\n}\n"
-    assert not machine.library(text, ["run"], machine.QUICK).is_optimized
+    assert not machine.library(text, ["run"], machine.QUICK_LEVEL).is_optimized
     machine.library(text, ["run"])
-    assert machine.library(text, ["run"], machine.QUICK).is_optimized
+    assert machine.library(text, ["run"], machine.QUICK_LEVEL).is_optimized

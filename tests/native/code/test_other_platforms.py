@@ -137,7 +137,7 @@ def test_a_solve_for_a_graphics_card_is_one_call(name):
 
 @needs_deferred
 @pytest.mark.parametrize(
-    ("solve", "most", "word"), [(_eigenvalues, host_program.FEW_MATRICES, "cusolver"), (_root, host_program.SMALL, "while")]
+    ("solve", "most", "word"), [(_eigenvalues, host_program.FEW_MATRICES, "cusolver"), (_root, host_program.FEW_NUMBERS, "while")]
 )
 def test_large_batches_stay_on_the_card(solve, most, word):
     """Batches of matrices, and of loops that all members run together."""
@@ -149,7 +149,7 @@ def test_large_batches_stay_on_the_card(solve, most, word):
 @needs_deferred
 def test_batches_of_loops_one_after_another_do_not():
     one_by_one = deferred(lambda xs: jax.lax.map(_root, xs))
-    card = jax.jit(one_by_one).trace(jnp.ones(host_program.SMALL + 1)).lower(lowering_platforms=("cuda",)).as_text()
+    card = jax.jit(one_by_one).trace(jnp.ones(host_program.FEW_NUMBERS + 1)).lower(lowering_platforms=("cuda",)).as_text()
     assert len(targets(card)) == 1 and "while" not in card
 
 

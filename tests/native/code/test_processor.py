@@ -30,7 +30,7 @@ def of_processor(monkeypatch):
             get_host_cpu_features = staticmethod(lambda: dict.fromkeys(features, True))
             get_default_triple = staticmethod(lambda: triple)
 
-        monkeypatch.setenv(processor.SETTING, setting)
+        monkeypatch.setenv(processor.LANES_VARIABLE, setting)
         monkeypatch.setattr(processor, "llvm", Llvm)
         return processor.lanes.__wrapped__()
 

@@ -23,7 +23,7 @@ from udkjax.native import loaded_code, primitive, records
 from udkjax.native.code import processor
 from udkjax.native.gpu import launch, launch_handler, target
 from udkjax.native.gpu.driver import CudaError
-from udkjax.native.gpu.kernel import VECTOR
+from udkjax.native.gpu.kernel import VECTOR_LENGTH
 from udkjax.native.host import ffi
 from udkjax.native.runs import RunCotangents
 
@@ -181,7 +181,7 @@ def card(monkeypatch):
     card, load = Launching(), launch.load_handler
     for name, value in {
         "PLATFORM": "cpu",
-        "TARGET": f"udkjax_test_{next(NUMBERS)}_",
+        "TARGET_PREFIX": f"udkjax_test_{next(NUMBERS)}_",
         "MEMBERS_OF_CORE": 1,
         "thread_count": lambda: 2,
         "driver": lambda: card,
@@ -190,8 +190,8 @@ def card(monkeypatch):
         "_has_memory": lambda of, kernel: True,
     }.items():
         monkeypatch.setattr(launch, name, value)
-    monkeypatch.setattr(launch_handler, "BLOCK", 4)
-    monkeypatch.setattr(processor, "lanes", lambda: VECTOR)
+    monkeypatch.setattr(launch_handler, "BLOCK_THREADS", 4)
+    monkeypatch.setattr(processor, "lanes", lambda: VECTOR_LENGTH)
     monkeypatch.setattr(loaded_code.LoadedCode, "name_on_card", loaded_code.LoadedCode.name)
     mlir.register_lowering(primitive.native_p, mlir.lower_fun(primitive._lower_for_card), platform="cpu")
     _forget()
@@ -212,7 +212,7 @@ NUMBERS = itertools.count()
 def both(request, function, *given):
     """Results of a compiled function with the CPU's code and with kernels; and the card."""
     machine_lanes = processor.lanes
-    processor.lanes = lambda: VECTOR
+    processor.lanes = lambda: VECTOR_LENGTH
     try:
         _forget()
         known = jax.tree.map(np.asarray, jax.jit(function)(*given))
@@ -286,7 +286,7 @@ def test_reverse_mode_runs_in_chunks_for_which_there_is_memory(request, monkeypa
         monkeypatch.setattr(Launching, "most", 3 * RECORD)
     known, found, card = both(request, gradients, ELEVEN)
     assert_array_equal(found, known)
-    assert card.lent[-1] == members * RECORD + launch_handler.SHARED
+    assert card.lent[-1] == members * RECORD + launch_handler.SHARED_BYTES
     whole, blocks = (3, 4), (-(-members // 4), 4)
     assert len(card.lent) == 1 + (limit == "steps")
     assert card.grids == [*[whole] * 3, *[blocks] * chunks * len(card.lent), whole]
@@ -317,7 +317,7 @@ def test_small_batches_stay_with_the_host(monkeypatch):
         return launch.kernel_target(call.operation, [np.zeros((members, *x.shape[1:])) for x in call.inputs])
 
     assert target_of(least - 1) is None
-    assert (target_of(least) or "").startswith(launch.TARGET)
+    assert (target_of(least) or "").startswith(launch.TARGET_PREFIX)
     for setting, members, served in (("7", 7, True), ("7", 6, False), ("never", 10**4, False)):
         monkeypatch.setenv("UDKJAX_KERNEL_MEMBERS", setting)
         assert (target_of(members) is not None) == served
@@ -338,7 +338,7 @@ def test_kernels_are_assembled(name):
             continue  # the first pass of another test
         text = target.ptx(kernel)
         assert "ld.local" in text or type(call.operation).__name__ == "FindScales"
-        assert target.assemble(text, target.NEWEST, assembler)[:4] == b"\x7fELF"
+        assert target.assemble(text, target.NEWEST_CAPABILITY, assembler)[:4] == b"\x7fELF"
 
 
 @pytest.mark.slow

@@ -139,7 +139,7 @@ def exact_results(name):
 
 
 def test_every_function_has_a_case():
-    assert set(CASES) == elementary.NAMES
+    assert set(CASES) == elementary.FUNCTION_NAMES
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -201,7 +201,7 @@ def test_errors_are_small_without_fused_multiply_add(monkeypatch, evaluate):
     if not llvm.get_default_triple().startswith("x86_64"):
         pytest.skip("other processors have fused multiply-add only")
     target = llvm.Target.from_default_triple().create_target_machine(
-        cpu="x86-64-v2", opt=machine.LEVEL, reloc="pic", codemodel="small", jit=True
+        cpu="x86-64-v2", opt=machine.OPTIMIZATION_LEVEL, reloc="pic", codemodel="small", jit=True
     )
     monkeypatch.setattr(machine, "_target_machine", lambda level: target)
     for name, case in CASES.items():

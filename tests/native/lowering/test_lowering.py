@@ -15,10 +15,10 @@ from tests.native.lowering.lowered import lowered, write
 from udkjax.native.code import processor
 from udkjax.native.language.program import UnsupportedError
 from udkjax.native.language.text import text_of_module
-from udkjax.native.lowering.lowering import APART, traced
+from udkjax.native.lowering.lowering import SEPARATE_FUNCTION_SIZE, traced
 from udkjax.native.lowering.module_calls import call_p
 from udkjax.native.lowering.own_objects import Written
-from udkjax.native.lowering.rules import CONTROL, ELEMENTWISE, RULES
+from udkjax.native.lowering.rules import CONTROL_RULES, ELEMENTWISE, RULES
 from udkjax.native.lowering.varying import inlined
 
 A, B = (np.random.default_rng(k).standard_normal((9, 4, 5)) for k in (0, 1))
@@ -127,7 +127,7 @@ def masks(a, b):
 
 def long(a, b):
     """More operations than a function has in machine code: it is split."""
-    for _ in range(APART):
+    for _ in range(SEPARATE_FUNCTION_SIZE):
         a = 0.9 * a + b
     return a, jnp.any(a > b)
 
@@ -260,8 +260,8 @@ def test_each_rule_has_a_case():
     seen = set().union(*(names_in(jax.make_jaxpr(f)(*shapes(given)).jaxpr) for f, given in CASES.values()))
     of_some_releases = {"expand_dims", "stack", "unstack"}
     of_modules = {call_p.name}  # tests/integrate/systems/test_own_stabilizations.py
-    assert {*ELEMENTWISE, *RULES, *CONTROL} - seen <= of_some_releases | of_modules
-    assert seen <= {*ELEMENTWISE, *RULES, *CONTROL}
+    assert {*ELEMENTWISE, *RULES, *CONTROL_RULES} - seen <= of_some_releases | of_modules
+    assert seen <= {*ELEMENTWISE, *RULES, *CONTROL_RULES}
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax as udk
-from udkjax.scene.elements.profiles import LAWS
+from udkjax.scene.elements.profiles import LIFT_LAWS
 
 LAW = {"base": 40, "law": ["cycloidal", "dwell", "3-4-5", "dwell"], "angle": [120, 60, 90, 90], "lift": [20, 0, -20, 0]}
 
@@ -19,9 +19,9 @@ def cam(profile=LAW, **more):
     return udk.Drawing({"O": (0, 0), "P": (0, 40)}, links, ["O"], slides, cams=cams, motors=motors, units=units).mechanism()
 
 
-@pytest.mark.parametrize("name", LAWS)
+@pytest.mark.parametrize("name", LIFT_LAWS)
 def test_laws_rise_from_zero_to_one_with_zero_slopes_at_both_ends(name):
-    law = LAWS[name]
+    law = LIFT_LAWS[name]
     slope, second = jax.grad(law), jax.grad(jax.grad(law))
     ends = np.array([0.0, 1.0])
     assert_allclose([law(x) for x in ends], [0.0, 0.0 if name == "dwell" else 1.0], atol=1e-14)

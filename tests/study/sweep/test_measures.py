@@ -10,7 +10,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax as udk
-from udkjax.native.loaded_code import FEW
+from udkjax.native.loaded_code import FEW_MEMBERS
 from udkjax.study.accuracy import exact_coordinates
 from udkjax.study.sweep.measures import RANK_NOT_REACHED, guess_label, measures_of
 
@@ -92,7 +92,7 @@ def test_measures_by_name_are_what_one_would_compute():
         # step before, a small difference of rounded numbers, so that steps end 4e-9 earlier or later; where the interpolated
         # output between them is 6e-6 off the constraints, it then differs by 1e-12, and by as much if the start moves by 1e-15.
         choices = {"rtol": 1e-5, "atol": 1e-5, "stabilization": stabilization, "throw": False}
-        equal = jax.vmap(lambda tol: udk.simulate(linkage, TS, method=udk.SVD(tol), **choices))(jnp.full(FEW + 1, 1e-4))  # noqa: B023
+        equal = jax.vmap(lambda tol: udk.simulate(linkage, TS, method=udk.SVD(tol), **choices))(jnp.full(FEW_MEMBERS + 1, 1e-4))  # noqa: B023
         solution = jax.tree.map(lambda x: x[0], equal)
         member, total = data.isel(stabilization=k, rank_tol=0), udk.energy(linkage, solution).total
         assert_allclose(member.q, solution.q, rtol=0, atol=1e-12)

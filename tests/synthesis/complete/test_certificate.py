@@ -6,7 +6,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from udkjax.synthesis.complete.balls import LONG, Ball, ComplexBall
+from udkjax.synthesis.complete.balls import LONG_DOUBLE, Ball, ComplexBall
 from udkjax.synthesis.complete.certificate import certify
 from udkjax.synthesis.complete.five_poses import find_real_dyads
 
@@ -26,7 +26,7 @@ def circle_and_line(level):
 def test_roots_are_held_by_their_boxes():
     start = np.array([[0.9, -0.9], [0.55, 0.55]])
     found = certify(circle_and_line(0.5), start)
-    exact = np.array([[1, -1], [1, 1]]) * np.array([[np.sqrt(LONG(0.75))], [LONG(0.5)]])
+    exact = np.array([[1, -1], [1, 1]]) * np.array([[np.sqrt(LONG_DOUBLE(0.75))], [LONG_DOUBLE(0.5)]])
     assert found.is_proven.all() and (found.radius < 1e-15).all()
     assert (np.abs(found.middle - exact) <= found.radius + 1e-18).all()
 

@@ -8,7 +8,7 @@ import pytest
 
 import udkjax as udk
 from udkjax.scene import SceneError
-from udkjax.synthesis.complete.four_bars import KINDS, FourBars, classify
+from udkjax.synthesis.complete.four_bars import GRASHOF_KINDS, FourBars, classify
 
 DATA = json.loads((Path(__file__).parents[2] / "data" / "path_synthesis.json").read_text())["nine_points"]
 LINKS = {name: {"pins": list(pins), "mass": 1.0} for name, pins in (("crank", "OA"), ("coupler", "ABP"), ("rocker", "CB"))}
@@ -175,7 +175,7 @@ def test_kinds_by_the_shortest_link(lengths, kind, turns):
     there = np.isfinite(B)
     bars = FourBars(np.zeros(1), np.full(1, complex(frame)), A[None, there], B[None, there], P[there])
     found = classify(bars)
-    assert KINDS[found.kind[0]] == kind and found.turns[0] == turns == there.all()
+    assert GRASHOF_KINDS[found.kind[0]] == kind and found.turns[0] == turns == there.all()
     if turns:
         assert found.defect[0] == 0 and (found.order[0] == np.arange(there.sum())).all()
 

@@ -9,7 +9,7 @@ from udkjax.cli.datasets import check_folder
 What = Literal[
     "run", "step_derivatives", "accelerations", "derivatives", "projection", "positions", "position_derivatives", "reactions"
 ]
-FUNCTIONS = "run", "accelerations"  # of C by default
+DEFAULT_FUNCTIONS = "run", "accelerations"  # of C by default
 
 
 def export(
@@ -17,7 +17,7 @@ def export(
     /,
     c: Path | None = None,
     fmu: Path | None = None,
-    what: tuple[What, ...] = FUNCTIONS,
+    what: tuple[What, ...] = DEFAULT_FUNCTIONS,
     kinds: tuple[Literal["co-simulation", "model-exchange"], ...] = ("co-simulation", "model-exchange"),
     parameters: tuple[str, ...] | None = None,
     inputs: tuple[str, ...] | None = None,

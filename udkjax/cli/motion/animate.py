@@ -9,7 +9,7 @@ import tyro
 
 from udkjax.cli.common import Json, fail, is_of_library, load, output_times, refuse, show
 from udkjax.cli.datasets import check_target
-from udkjax.extras import NETCDF, WRITERS, require
+from udkjax.extras import NETCDF_PACKAGES, WRITING_PACKAGES, require
 
 if TYPE_CHECKING:
     import numpy as np
@@ -69,7 +69,10 @@ def animate(
     """
     check_target(out, ANIMATION_SUFFIXES)
     kind = out.suffix.lower()
-    require(*WRITERS.get(kind, ()), *(NETCDF if any(file.suffix.lower() in (".nc", ".h5") for file in files) else ()))
+    require(
+        *WRITING_PACKAGES.get(kind, ()),
+        *(NETCDF_PACKAGES if any(file.suffix.lower() in (".nc", ".h5") for file in files) else ()),
+    )
     if not files:
         refuse("give a run (.nc) or a scene (.toml)")
     if not 0 < dt <= t1 < math.inf:

@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from udkjax.cli.common import Json, Scene, channels_of, fail, load, measure_channels, output_times, refuse, show
 from udkjax.cli.datasets import PICTURE_SUFFIXES, check_target, save
-from udkjax.extras import NETCDF, require
+from udkjax.extras import NETCDF_PACKAGES, require
 
 # The names in udkjax.study.choices, which cannot be imported here, since it imports JAX.
 Method = Literal["auto", "elimination", "svd", "varga", "greville", "householder", "gram-schmidt"]
@@ -74,7 +74,7 @@ def simulate(
     if plot == out:
         refuse(f"--out {out} and --plot {plot} are the same file")
     check_target(plot, PICTURE_SUFFIXES, "--plot")
-    require(*NETCDF, "matplotlib")
+    require(*NETCDF_PACKAGES, "matplotlib")
     mech, text = load(scene)
     measured = channels_of(mech, channels)
 

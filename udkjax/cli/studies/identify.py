@@ -9,7 +9,7 @@ import tyro
 
 from udkjax.cli.common import Json, Quiet, Scene, fail, load, show
 from udkjax.cli.datasets import check_folder
-from udkjax.extras import BAYES, NETCDF, require
+from udkjax.extras import BAYES_PACKAGES, NETCDF_PACKAGES, require
 
 if TYPE_CHECKING:
     from udkjax import Estimate, Posterior
@@ -84,7 +84,7 @@ def identify(
     """
     for folder in filter(None, (out, posterior)):
         check_folder(folder)
-    require(*NETCDF, "matplotlib", *(BAYES if posterior else ()))
+    require(*NETCDF_PACKAGES, "matplotlib", *(BAYES_PACKAGES if posterior else ()))
     mech, text = load(scene)
 
     import udkjax as udk

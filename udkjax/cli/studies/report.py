@@ -11,7 +11,7 @@ import tyro
 from udkjax.cli.common import Json, Quiet, refuse, show
 
 # Variables of each run in the JSON.
-VERDICT = (
+RUN_VARIABLES = (
     "group",
     "method",
     "solver",
@@ -76,7 +76,7 @@ def report(
         files.insert(0, target.with_suffix(".nc"))
         record.save(data, files[0])
     page.write(data, target)
-    verdicts = [dict(zip(VERDICT, row)) for row in zip(*(data[name].values for name in VERDICT))]
+    verdicts = [dict(zip(RUN_VARIABLES, row)) for row in zip(*(data[name].values for name in RUN_VARIABLES))]
     show({"runs": verdicts, "files": files}, "\n".join(f"wrote {file}" for file in files), json)
 
 

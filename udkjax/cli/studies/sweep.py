@@ -11,7 +11,7 @@ import tyro
 
 from udkjax.cli.common import INTERRUPTED, Json, Quiet, Scene, load, refuse, say, show
 from udkjax.cli.datasets import check_folder
-from udkjax.extras import NETCDF, require
+from udkjax.extras import NETCDF_PACKAGES, require
 
 if TYPE_CHECKING:
     from udkjax import Mechanism
@@ -54,7 +54,7 @@ def sweep(
         refuse(f"--memory {memory:g}: must be positive")
     if scheduler is not None and engine == "devices":
         refuse("--scheduler needs --engine dask")
-    require(*NETCDF, "matplotlib", *(("dask", "distributed") if engine == "dask" else ()))
+    require(*NETCDF_PACKAGES, "matplotlib", *(("dask", "distributed") if engine == "dask" else ()))
     mech, text = load(scene)
 
     from udkjax.study.sweep.dimensions import SweepError

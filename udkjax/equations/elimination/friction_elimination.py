@@ -20,7 +20,7 @@ as in most machines. Programs that a run evaluates often take one round, and rep
 then takes as many further rounds as are needed (`further`). A round begins where the step of the last one ended if the
 correction did not bring the loads much closer to a solution. Where rounds go back and forth between two sets of signs of the
 loads, machine code follows the solution from that without friction on, with a growing `friction_share` of G. Programs that are
-differentiated begin with the loads that settled in this way. Other programs take `ROUNDS`. If the loads do not settle,
+differentiated begin with the loads that settled in this way. Other programs take `FRICTION_ROUNDS`. If the loads do not settle,
 friction admits no motion (the mechanism jams), and the accelerations are NaN.
 
 A load may obey the equations twice: once as it grows out of the motion without friction, and once with another sign, against
@@ -51,11 +51,11 @@ from udkjax.expressions.loops.loop_program import ADD, KernelLoop, KernelWriter,
 from udkjax.expressions.scalars.selection import either, floor, greater, where
 
 # Rounds of programs that cannot ask for more. At 0.9 of the coefficients that jam pins, three are needed.
-ROUNDS = 4
-CORRECTION = SOLVES  # the number of the system of corrections
+FRICTION_ROUNDS = 4
+CORRECTION_SOLVE = SOLVES  # the number of the system of corrections
 # Relative change of the loads of friction by another correction. The accelerations have this error times the share of friction,
 # which is below the smallest tolerance of runs; one more round would end at rounding errors.
-SETTLED = 1e-10
+LOAD_CHANGE_TOL = 1e-10
 # Share of the rest of the loads of friction after a step. A correction, which has the factors of the loads before, must not
 # change it by more: where the direction of a load turns within a step, it undoes what the step has gained, for ever where the
 # load is nearly zero and has another sign.
@@ -78,8 +78,8 @@ class FrictionElimination:
             "drag": layout.coordinate_count,
             "new_drag": layout.coordinate_count,
         }
-        layout.add_solve(CORRECTION)
-        layout.sizes["settled"] = layout.sizes[f"x{CORRECTION}"]
+        layout.add_solve(CORRECTION_SOLVE)
+        layout.sizes["settled"] = layout.sizes[f"x{CORRECTION_SOLVE}"]
         layout.sizes["friction_share"] = 1
 
     # --- programs
@@ -88,13 +88,13 @@ class FrictionElimination:
         """Yield loops that replace x of a system, without friction, by x with friction, and jt_x by J^T x + G(x).
 
         Both are NaN if x does not settle. With `reports` there is one round only; `unsettled` then tells whether it suffices (see
-        `_unsettled`), and `settled` is x. Without `reports` there are `ROUNDS` rounds.
+        `_unsettled`), and `settled` is x. Without `reports` there are `FRICTION_ROUNDS` rounds.
         """
         yield from self._skew.form_symmetric
         yield from self.sharing.find_null_space()
         yield from self.sharing.share(solve)
         yield from self._correct(solve, v, self._symmetric_substitute, has_slopes=False)
-        for _ in range(1 if reports else ROUNDS):
+        for _ in range(1 if reports else FRICTION_ROUNDS):
             yield from self._round(solve, v, reports=reports)
         yield from self._finish(solve, v, reports)
 
@@ -201,9 +201,9 @@ class FrictionElimination:
                 for i, row in enumerate(group.rows):
                     w.write(w.read("right", RIGHT, i) - dot(w.graph, group.entries(w, row), slip), "rest", RIGHT, i)
 
-            names = {"right": f"right{solve}", "rest": f"right{CORRECTION}"}
+            names = {"right": f"right{solve}", "rest": f"right{CORRECTION_SOLVE}"}
             yield KernelLoop(terms.kernel(("rest of right", group), rest), group.table, names)
-        yield from substitute(CORRECTION, x=solve)
+        yield from substitute(CORRECTION_SOLVE, x=solve)
         yield from self.sharing.share(solve)
 
     def _drag(self, solve: int, v: str, to: str, has_slopes: bool = True, in_part: bool = False) -> ProgramParts:
@@ -296,7 +296,7 @@ def _in_part(w: KernelWriter, x: Scalar) -> Scalar:
 
 def _fails(w: KernelWriter) -> Scalar:
     """Return a scalar that is true if G(x) has not settled, or the determinant of the last factors is negative."""
-    limit, half = w.read("rubbing", None) * SETTLED**2, w.read("negative", None) * 0.5
+    limit, half = w.read("rubbing", None) * LOAD_CHANGE_TOL**2, w.read("negative", None) * 0.5
     is_odd = greater(half - floor(half), w.graph.constant(0.25))
     return either(greater(w.read("misfit", None), limit), is_odd)
 

@@ -18,9 +18,9 @@ NOT_DIFFERENTIATED += ("slopes", "base", "skew", "skew_factors", "misfit", "left
 NOT_DIFFERENTIATED += LoadSharing.FIXED
 
 # The outputs that are x + z or x - z with z = C J^T y, J C J^T y = right: the right-hand side, x, and the sign.
-IMPLICIT = {"a": ("b", "free", 1), "q1": ("psi", "q", -1), "v1": ("psi_dot", "v", -1)}
+IMPLICIT_OUTPUTS = {"a": ("b", "free", 1), "q1": ("psi", "q", -1), "v1": ("psi_dot", "v", -1)}
 # The outputs of the projection of a state on the manifold.
-PROJECTION = ("q1", "v1 at q1")
+PROJECTION_OUTPUTS = ("q1", "v1 at q1")
 
 # Arrays of the second correction of a solution, whose first-order changes vanish after the first correction.
 SECOND_CORRECTION = ("right2", "sum2", "y2", "x2")
@@ -69,12 +69,12 @@ class DifferentiablePrograms:
         self._programs: dict[tuple[str, ...], DifferentiableProgram] = {}
 
     def of(self, *outputs: str) -> DifferentiableProgram:
-        """Return the program of one of the outputs `IMPLICIT`, or of the `PROJECTION` of a state on the manifold.
+        """Return the program of one of the outputs `IMPLICIT_OUTPUTS`, or of the `PROJECTION_OUTPUTS` of a state on the manifold.
 
         The program of the accelerations also sets `safe`, and starts from the loads of joints with friction in `settled`.
         """
         if outputs not in self._programs:
-            self._programs[outputs] = self._projection() if outputs == PROJECTION else self._implicit(*outputs)
+            self._programs[outputs] = self._projection() if outputs == PROJECTION_OUTPUTS else self._implicit(*outputs)
         return self._programs[outputs]
 
     def _projection(self) -> DifferentiableProgram:
@@ -127,8 +127,8 @@ class DifferentiablePrograms:
             yield from friction.add_loads(0)
 
     def _implicit(self, target: str) -> DifferentiableProgram:
-        """Return the program that computes `target`, a key of `IMPLICIT`."""
-        solver, terms, (right, x, sign) = self._solver, self._solver.terms, IMPLICIT[target]
+        """Return the program that computes `target`, a key of `IMPLICIT_OUTPUTS`."""
+        solver, terms, (right, x, sign) = self._solver, self._solver.terms, IMPLICIT_OUTPUTS[target]
         loads = [*terms.free_accelerations("v")] if target == "a" else []
         z, result = terms.add("z", solution=0), terms.add(target, start=x, change="z", sign=sign)
         system = [terms.sincos(), *loads, *terms.element_terms(("psi_q", right)), *solver.factorize]

@@ -15,8 +15,8 @@ from udkjax.equations.programs.scene_programs import programs_of_structure
 from udkjax.equations.terms.rest_program import REDUCED
 from udkjax.equations.terms.structure import Structure
 
-WORTH = 100  # answers for one structure by singular values before elimination is prepared
-CLEAR = 0.1  # smallest relative distance from dependent rows: elimination loses accuracy by the square of its reciprocal
+USES_BEFORE_ELIMINATION = 100  # answers for one structure by singular values before elimination is prepared
+LEAST_DISTANCE = 0.1  # smallest relative distance from dependent rows: elimination loses accuracy by the square of its reciprocal
 
 
 class AlongTangent(NamedTuple):
@@ -50,20 +50,20 @@ class Eliminated:
         None if singular values are needed: programs are not prepared, or rows are not clearly independent.
         """
         found = (arrays := self._prepared()) and arrays.newton_step(t, q)
-        return None if not found or not found[2] > CLEAR else found[:2]
+        return None if not found or not found[2] > LEAST_DISTANCE else found[:2]
 
     def linearization(self, t: float, q: np.ndarray, direction: np.ndarray) -> "AlongTangent | None":
         """Return the linearization at rest along the tangent part of a direction; None as in `newton_step`."""
         found = (arrays := self._prepared()) and arrays.linearization(t, q, direction)
-        if not found or not found["distance"][0] > CLEAR:
+        if not found or not found["distance"][0] > LEAST_DISTANCE:
             return None
         square, stiffness, damping = found[REDUCED].tolist()
         return AlongTangent(found["dq1"], square, stiffness, damping, found["dv"], -found["multipliers"])
 
     def _prepared(self) -> SceneArrays[np.ndarray] | None:
-        """Return the programs with their arrays; None until `WORTH` answers for this structure have been asked for."""
+        """Return the programs with their arrays, or None before `USES_BEFORE_ELIMINATION` uses of this structure."""
         if self._arrays is None:
-            if len(self._uses) < WORTH:
+            if len(self._uses) < USES_BEFORE_ELIMINATION:
                 self._uses.append(0)
                 return None
             kind, numbers, redundant_rows, length = self._given
@@ -75,5 +75,5 @@ class Eliminated:
 
 @lru_cache(maxsize=64)
 def _uses(kind: Structure, redundant_rows: tuple[int, ...]) -> list[int]:
-    """Return the cached list that counts uses of a structure with these redundant rows, up to `WORTH`: one entry per use."""
+    """Return the cached list with one entry for each of the first `USES_BEFORE_ELIMINATION` uses of a structure."""
     return []

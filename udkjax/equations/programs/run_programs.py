@@ -54,13 +54,13 @@ OUTPUTS = {
     "dq1 by value": "q' by this value, from Psi_q q' = -Psi_t",
     "dv1 by value": "q'' by this value, from Psi_q q'' = gamma at the velocities q'",
 }
-ACCELERATIONS = frozenset(("a", "a further", "a settled", "a at v1"))  # outputs that follow the policy for pivots
+ACCELERATION_OUTPUTS = frozenset(("a", "a further", "a settled", "a at v1"))  # outputs that follow the policy for pivots
 # The arrays that programs return; all others are scratch.
-RESULTS = (
+RETURNED_ARRAYS = (
     *("a", "q1", "v1", "dq1", "dv1", "psi", "psi_dot", "terms", "rank", "distance", "safe", "pieces", "root", "energy"),
     *("independent", "multipliers", "unsettled", "settled", "friction_power", "drift"),
 )
-ENTRIES = "psi_q", "couplings"  # the arrays that only programs return which are asked for Psi_q
+JACOBIAN_ARRAYS = "psi_q", "couplings"  # the arrays that only programs return which are asked for Psi_q
 
 
 class Differentiable(Protocol):
@@ -135,7 +135,7 @@ class RunPrograms:
 
     def drops(self, outputs: Collection[str]) -> bool:
         """Return whether a program with these outputs leaves out rows with small pivots."""
-        return self.policy.drops or ACCELERATIONS.isdisjoint(outputs)
+        return self.policy.drops or ACCELERATION_OUTPUTS.isdisjoint(outputs)
 
     @property
     def marks(self) -> slice:

@@ -15,8 +15,8 @@ from udkjax.expressions.loops.array_loops import ArrayLoops
 from udkjax.programs.identity_cache import cached_by_identity
 from udkjax.scene.mechanism import Mechanism
 
-ACCELERATIONS = "a", "multipliers", "distance", "psi_q"
-LINEARIZATION = "dq1", "dv", "dv1", "multipliers", "distance", REDUCED
+ACCELERATION_OUTPUTS = "a", "multipliers", "distance", "psi_q"
+LINEARIZATION_OUTPUTS = "dq1", "dv", "dv1", "multipliers", "distance", REDUCED
 
 
 class Accelerations(NamedTuple):
@@ -95,14 +95,16 @@ class SceneArrays(Generic[AnyArray]):
     def linearization(self, t: Time, q: AnyArray, direction: AnyArray) -> dict[str, AnyArray] | None:
         """Return the linearization at rest along the tangent part of `direction`, by elimination.
 
-        The result has the arrays `LINEARIZATION` by name, which `RestProgram.reduction` and the output "balance" explain; None if
-        neither machine code nor Python's floats can run the program.
+        The result has the arrays `LINEARIZATION_OUTPUTS` by name, which `RestProgram.reduction` and the output "balance" explain.
+        It is None if neither machine code nor Python's floats can run the program.
         """
-        return self._run_at_state(LINEARIZATION, t, q, self._xp.zeros_like(q), {"dq": direction}, often=True)
+        return self._run_at_state(LINEARIZATION_OUTPUTS, t, q, self._xp.zeros_like(q), {"dq": direction}, often=True)
 
     def accelerations(self, t: Time, q: AnyArray, v: AnyArray) -> "Accelerations | None":
         """Return accelerations at many states by elimination in machine code; None until compiling the program pays off."""
-        found: Any = self._run_at_many(self._evaluator(ACCELERATIONS), {"t": np.asarray(t, float).reshape(1, -1), "q": q, "v": v})
+        found: Any = self._run_at_many(
+            self._evaluator(ACCELERATION_OUTPUTS), {"t": np.asarray(t, float).reshape(1, -1), "q": q, "v": v}
+        )
         entries: Any = found and self._entries(found)
         return found and Accelerations(found["a"], found["multipliers"], found["distance"][0], entries)
 
@@ -197,8 +199,8 @@ class _Evaluator(NamedTuple):
 def _evaluator(programs: ScenePrograms, xp: ArrayLibrary, *outputs: str) -> _Evaluator:
     """Return the program of some outputs as an `_Evaluator`."""
     p, n, m = programs, programs.coordinate_count, programs.row_count
-    at_rest = p.at_rest.sizes if outputs[0] in (*OF_LOADS, CURVATURE) or outputs == LINEARIZATION else {}
-    program = p.linearization if outputs == LINEARIZATION else p.at_rest.of(*outputs) if at_rest else p.of(*outputs)
+    at_rest = p.at_rest.sizes if outputs[0] in (*OF_LOADS, CURVATURE) or outputs == LINEARIZATION_OUTPUTS else {}
+    program = p.linearization if outputs == LINEARIZATION_OUTPUTS else p.at_rest.of(*outputs) if at_rest else p.of(*outputs)
     sizes = p.scratch | {"psi": m, "psi_dot": m, "multipliers": m, "terms": p.term_count, "energy": 2} | at_rest
     sizes |= dict.fromkeys(("a", "q1", "dq1", "dv", "dv1"), n) | {"distance": 1, REDUCED: 3}
     results = tuple(x for x in outputs if not at_rest or x in program.written)

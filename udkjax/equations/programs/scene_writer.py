@@ -12,7 +12,7 @@ from udkjax.equations.terms.scene_terms import ProgramParts, compliance
 from udkjax.expressions.loops.loop_program import ADD, KernelLoop, KernelWriter, LoopProgram, Reset
 
 # The right-hand sides at the state of the linear systems of a program, with the results that need them.
-RIGHTS = {
+RIGHT_SIDES = {
     "b": ("solution", "a", "a further", "a settled", "a refined"),
     "psi": ("q1", "q1 refined"),
     "psi_dot": ("v1", "v1 refined", "dq1 by value"),
@@ -37,7 +37,7 @@ class SceneWriter:
         self._solver, self._terms, self._outputs, self._drops = solver, solver.terms, outputs, drops
         has_friction = solver.friction is not None
         with_friction: Requires = ("solution",) if has_friction and "terms with friction" in outputs else ()
-        self._rights = [right for right, users in RIGHTS.items() if not {*outputs, *with_friction}.isdisjoint(users)]
+        self._rights = [right for right, users in RIGHT_SIDES.items() if not {*outputs, *with_friction}.isdisjoint(users)]
         self._solves = len(self._rights)
         self._table = self._terms_of_equations(with_friction) | self._results_of_elimination()
 

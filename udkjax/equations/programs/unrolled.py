@@ -10,14 +10,14 @@ from itertools import product
 from typing import NamedTuple
 
 from udkjax.equations.programs.differentiable_programs import DifferentiableProgram
-from udkjax.equations.programs.run_programs import ENTRIES, RESULTS, RunPrograms
+from udkjax.equations.programs.run_programs import JACOBIAN_ARRAYS, RETURNED_ARRAYS, RunPrograms
 from udkjax.expressions import Graph, Scalar, ScalarProgram, cotangents, frontier, tangents
 from udkjax.expressions.loops.loop_derivative import COTANGENT, FORWARD, OTHER, PREFIXES, REVERSE, SECOND, TANGENT, TWICE
 from udkjax.expressions.loops.loop_program import LoopProgram
 from udkjax.expressions.loops.unroll import ArrayPlace, Arrays, unroll
 
 OutputNames = tuple[str, ...]
-SLOPES = ("slopes",)  # the key of the derivative of the accelerations by the state alone
+SLOPES_KEY = ("slopes",)  # the key of the derivative of the accelerations by the state alone
 
 
 class UnrolledProgram(NamedTuple):
@@ -72,15 +72,15 @@ class Unrolled:
         self._results = {}
         for outputs in asked:
             arrays = self._unroll(programs.of(*outputs), begins if programs.goes_on(outputs) else None)
-            returned = ENTRIES if {"psi_q", "psi_q of q"} & {*outputs} else ()
-            self._results[outputs] = _entries(arrays, RESULTS + returned)
+            returned = JACOBIAN_ARRAYS if {"psi_q", "psi_q of q"} & {*outputs} else ()
+            self._results[outputs] = _entries(arrays, RETURNED_ARRAYS + returned)
         active_nodes = _depending(graph, [s for s, m in zip(self.numbers, active, strict=False) if m])
         self.moving = [k for k, s in sorted(layout.items()) if s.index in active_nodes]
         """The constants that depend on active numbers; derivatives index only these."""
         self._derivatives = {x: self._differentiate(programs.differentiable.of(*x), n, mode, self.moving) for x in differentiated}
         if slopes:
             accelerations = programs.for_derivatives.differentiable.of("a")
-            self._derivatives[SLOPES] = self._differentiate(accelerations, n, FORWARD, ())
+            self._derivatives[SLOPES_KEY] = self._differentiate(accelerations, n, FORWARD, ())
         outputs = [
             s
             for result in (*self._results.values(), *(x for d in self._derivatives.values() for x in d))
@@ -113,7 +113,7 @@ class Unrolled:
     @property
     def slopes(self) -> UnrolledDerivative:
         """The program of the accelerations, with their derivative by q and v but not by numbers."""
-        return self.derivative(*SLOPES)
+        return self.derivative(*SLOPES_KEY)
 
     def evaluations(self, named: Mapping[str, OutputNames]) -> UnrolledProgram:
         """Return the program of all numbers that the derivatives of some programs need at one state.

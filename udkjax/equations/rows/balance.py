@@ -32,10 +32,10 @@ LEAST_SPREAD = 2
 RANDOM_POSITIONS = 2  # within L and one radian of the guess: a coefficient that is small there and at the guess is small anywhere
 # Relative difference of coefficients that do not depend on positions: far above rounding errors of angles of any usual size, and
 # far below what a radian changes.
-SAME = 1e-6
+CONSTANT_COEFFICIENT_TOL = 1e-6
 # Weight that ends the freedom to multiply all rows and divide all columns of a part of the scene; the weights of coefficients are
 # at most one.
-ANCHOR = 1e-9
+ANCHOR_WEIGHT = 1e-9
 MANY_UNKNOWNS = 400  # rows and groups above which sparse matrices are used
 
 
@@ -84,7 +84,7 @@ class _Coefficients:
         largest = np.zeros(self.row_count)
         np.maximum.at(largest, rows, size)
         moves = size > ROUNDING * largest[rows]
-        varies = np.ptp(found, axis=0) > SAME * size
+        varies = np.ptp(found, axis=0) > CONSTANT_COEFFICIENT_TOL * size
         self.is_free = np.ones(self.group_count, bool)
         self.is_free[groups[moves & varies]] = False
         self.rows, self.groups, self.size = rows[moves], groups[moves], size[moves]
@@ -97,7 +97,7 @@ def _solve(sizes: _Coefficients) -> np.ndarray:
     free = sizes.is_free[sizes.groups]
     columns = m + sizes.groups
     count = m + sizes.group_count
-    diagonal = ANCHOR + np.bincount(sizes.rows, w, count) + np.bincount(columns, w, count)
+    diagonal = ANCHOR_WEIGHT + np.bincount(sizes.rows, w, count) + np.bincount(columns, w, count)
     right = -np.bincount(sizes.rows, w * logs, count) - np.bincount(columns, w * logs, count)
     right[m:][~sizes.is_free] = 0.0
     i, k, off = sizes.rows[free], columns[free], w[free]

@@ -20,8 +20,8 @@ from udkjax.equations.rows.position_closure import CLOSURE
 
 POSITION_SAMPLES = 24  # positions of the random motion, if the first one has dependent rows
 MANY_ROWS = 300  # rows of Psi above which only a third of the positions is used, to save time
-FAILURES = 3  # after this many positions in succession that cannot be closed, the drivers are contradictory
-CREEP = 1e-3  # fraction of the drivers' time step to try next if the first positions cannot be closed
+MOST_FAILURES = 3  # after this many positions in succession that cannot be closed, the drivers are contradictory
+RETRY_STEP_FRACTION = 1e-3  # fraction of the drivers' time step to try next if the first positions cannot be closed
 HEADING_NOISE = 0.3  # fraction of the direction of the random motion that is new at each position
 NEGLIGIBLE_SHARE = 1e-6  # coefficients of unit rows up to this size are rounding errors
 GENERIC_TOL = 0.05  # smallest singular value, relative to the largest, of positions that are used to choose rows
@@ -113,10 +113,10 @@ class PositionRows(ABC, Generic[Position]):
             full_rank = [p for p in positions if p.is_clear and p.rank == self.count]
             if full_rank:
                 return full_rank[:1]
-            if failures == FAILURES:
+            if failures == MOST_FAILURES:
                 if any(p.is_clear for p in positions[1:]):
                     break
-                time_step = CREEP * self.driver_time_step
+                time_step = RETRY_STEP_FRACTION * self.driver_time_step
             last = positions[-1]
             heading = heading / np.linalg.norm(heading) + HEADING_NOISE * random.standard_normal(self.size) / np.sqrt(self.size)
             heading = last.tangent_part(heading)  # keep the direction, so that the motion covers the range

@@ -25,10 +25,11 @@ from udkjax.scene.elements.joints import Angle, Prismatic, Revolute
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.numbers.origin import Origin
 
-FITS = 1e-5  # largest part of l l^T that no Q has: closed positions err by up to 1e-6, the root of rounding errors of Psi
+# Largest part of l l^T that no Q has: closed positions err by up to 1e-6, the root of rounding errors of Psi.
+SQUARE_FIT_TOL = 1e-5
 REFINEMENTS = 3  # each doubles the number of right digits
-SMALL = 1e-2  # singular values, relative to the largest, up to which gradients may vanish nearby
-POSITIONS = 4  # positions of the motion in which a pin must not turn either
+SMALL_SINGULAR_VALUE = 1e-2  # singular values, relative to the largest, up to which gradients may vanish nearby
+TESTED_POSITIONS = 4  # positions of the motion in which a pin must not turn either
 
 
 class HeldPin(NamedTuple):
@@ -93,7 +94,7 @@ def _closed(rows: KinematicRows, q: np.ndarray) -> DensePosition | None:
         if not np.all(np.isfinite(D)):
             return at
         u, sigma, vt = np.linalg.svd(D)
-        small = np.flatnonzero((sigma > DEPENDENT_TOL * sigma[0]) & (sigma <= SMALL * sigma[0]))
+        small = np.flatnonzero((sigma > DEPENDENT_TOL * sigma[0]) & (sigma <= SMALL_SINGULAR_VALUE * sigma[0]))
         for k in small:
             v = rows.metric * vt[k]
             growth = (u[:, k] / length) @ _second_derivatives(rows, 0.0, q, v[:, None])[0, 0]
@@ -128,10 +129,10 @@ def _held(mechanism: Mechanism, rows: KinematicRows, at: DensePosition) -> Itera
         turn = sum(sign * tangents[k] for sign, k in zip((-1, 1), places, strict=True) if k is not None)
         square = np.outer(turn, turn)
         largest = np.abs(square).max()
-        weights = np.linalg.lstsq(curvatures.reshape(len(curvatures), -1).T, square.ravel(), rcond=FITS)[0]
+        weights = np.linalg.lstsq(curvatures.reshape(len(curvatures), -1).T, square.ravel(), rcond=SQUARE_FIT_TOL)[0]
         error, stress = np.abs(np.einsum("k,kab->ab", weights, curvatures) - square).max(), stresses @ weights
         force = stress[owners == name]
-        if largest > CLEAR_TOL and error <= FITS * largest and np.abs(force).max() > CLEAR_TOL * np.abs(stress).max():
+        if largest > CLEAR_TOL and error <= SQUARE_FIT_TOL * largest and np.abs(force).max() > CLEAR_TOL * np.abs(stress).max():
             angles = [0.0 if k is None else float(at.q[k]) for k in places]
             yield HeldPin(name, tuple(joint.bodies), angles[1] - angles[0], float(np.arctan2(force[1], force[0])))
 
@@ -156,7 +157,7 @@ def _motion(mechanism: Mechanism, start: DensePosition) -> Iterator[DensePositio
     """Iterate over closed positions of a random motion, and of the drivers, from a position; none if this cannot be closed."""
     rows, random = KinematicRows(mechanism), np.random.default_rng(0)
     last, heading = rows.close(start.t, start.q), random.standard_normal(len(start.q))
-    for k in range(POSITIONS):
+    for k in range(TESTED_POSITIONS):
         if last is None:
             return
         step = rows.metric * last.tangent_part(heading)

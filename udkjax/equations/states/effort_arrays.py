@@ -20,8 +20,10 @@ from udkjax.scene.mechanism import Mechanism
 # Efforts (k, T), rates of their coordinates (k, T), unbalanced parts of the loads (T,).
 EffortArrays: TypeAlias = tuple[NumericArray, NumericArray, NumericArray]
 Slopes: TypeAlias = Callable[[np.ndarray], np.ndarray]
-ALONG = 64 * float(np.finfo(float).eps)  # largest |J u| of a motion u that satisfies J u = 0 up to rounding, relative to J
-CLEARLY = 0.1  # rank tolerance over the rank tolerance at which rows would count as dependent, for which a bound is known
+# Largest |J u| of a motion u that satisfies J u = 0 up to rounding, relative to J.
+NULL_MOTION_TOL = 64 * float(np.finfo(float).eps)
+# Rank tolerance over the rank tolerance at which rows would count as dependent, for which a bound is known.
+REGULARITY_MARGIN = 0.1
 
 
 @np.errstate(all="ignore")  # states that are not finite have no efforts
@@ -129,7 +131,7 @@ def _efforts_along(
     square = (rates * rates).sum(0)
     found = (speed > 0) & (square > RANK_TOL**2 * (pull * pull).sum((0, 1)))
     if len(entries):
-        found &= equations.largest_row(u[equations.entries[1]] * entries) <= ALONG * largest
+        found &= equations.largest_row(u[equations.entries[1]] * entries) <= NULL_MOTION_TOL * largest
     f = rates * (power / np.where(square > 0, square, 1.0))
     return f, np.abs(u).max(0) * np.abs(power - (rates * f).sum(0)), found
 
@@ -164,11 +166,11 @@ def _regular_efforts(scale: _Units, J: np.ndarray, pull: np.ndarray, missing: np
         inverse = np.linalg.inv(A)
     except np.linalg.LinAlgError:  # at some time
         inverse = np.linalg.inv(np.where((np.linalg.slogdet(A)[0] == 0)[:, None, None], np.eye(A.shape[1]), A))
-    regular = (_length(A) * _length(inverse) * RANK_TOL < CLEARLY) & (drivers > 0)
+    regular = (_length(A) * _length(inverse) * RANK_TOL < REGULARITY_MARGIN) & (drivers > 0)
     if len(scale.redundant):
         null_space = inverse[:, :, len(scale.independent) :]
         off = _length(J[:, scale.redundant] @ null_space) * _length(A)
-        regular &= off < CLEARLY * RANK_TOL * joints
+        regular &= off < REGULARITY_MARGIN * RANK_TOL * joints
     z = (missing[:, None] @ inverse)[:, 0]
     unbalanced = np.abs(missing - (z[:, None] @ A)[:, 0]).max(1)
     return factor[:, None] * z[:, len(scale.independent) :], unbalanced, regular

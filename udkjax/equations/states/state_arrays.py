@@ -17,7 +17,7 @@ from udkjax.arrays import is_traced, is_within_jit
 from udkjax.equations.elimination.dense_pseudoinverse import FEW_ROWS, dense_pseudoinverse, has_independent_rows
 from udkjax.equations.laws.abstract_system import HistoryLike, times_of
 from udkjax.equations.laws.udwadia_kalaba import Baumgarte
-from udkjax.equations.programs.eliminated_steps import CLEAR
+from udkjax.equations.programs.eliminated_steps import LEAST_DISTANCE
 from udkjax.equations.programs.scene_arrays import SceneArrays, arrays_in_time
 from udkjax.equations.rows.analysis import Analysis
 from udkjax.equations.terms.loads import mass_of
@@ -28,7 +28,7 @@ from udkjax.programs.identity_cache import cached_by_identity
 from udkjax.scene.elements.friction import Friction
 from udkjax.scene.mechanism import Mechanism
 
-PIECE = 2**24  # bytes of a piece's largest arrays
+PIECE_BYTES = 2**24  # bytes of a piece's largest arrays
 DENSE_ARRAYS = 8  # of the size of Psi_q, which a state needs at once
 
 
@@ -93,7 +93,7 @@ class StateArrays:
     def pieces(self, count: int, dense: bool = True) -> Iterator[slice]:
         """Iterate over slices of `count` states that need little memory at once; `dense` if Psi_q is stored as a dense matrix."""
         numbers = DENSE_ARRAYS * max(self.count * self.size, 1) if dense else 64 * (self.size + self.count)
-        step = max(1, PIECE // (8 * numbers))
+        step = max(1, PIECE_BYTES // (8 * numbers))
         return (slice(k, k + step) for k in range(0, max(count, 1), step))
 
     def _evaluate(self, quantity: Callable[..., Any], t: np.ndarray, q: np.ndarray, v: np.ndarray) -> Any:
@@ -184,7 +184,7 @@ class StateArrays:
         by_default = baumgarte is None and (method is None or method.rank_tol is None)
         are_independent = self.count > 0 and analysis.redundant_rows == ()
         found = self._at.accelerations(t, q.T, v.T) if by_default and are_independent else None
-        if found is not None and found.distance.min() > CLEAR:
+        if found is not None and found.distance.min() > LEAST_DISTANCE:
             return Multipliers(found.a.T, found.multipliers.T, found.entries)
         psi, rate, entries = self._evaluate(self._at.geometry, t, q, v)
         free, b = self._evaluate(self._at.loads, t, q, v)

@@ -7,10 +7,10 @@ import jax
 import numpy as np
 from jaxtyping import Array, ArrayLike
 
-from udkjax.equations.systems.traced_system import FUNCTIONS, joined_rows
+from udkjax.equations.systems.traced_system import FUNCTION_ARGUMENTS, joined_rows
 from udkjax.programs.deferred import deferred
 
-SINGULAR = 1e-12  # M is singular if its smallest eigenvalue is at most this, relative to the largest
+SINGULAR_TOL = 1e-12  # M is singular if its smallest eigenvalue is at most this, relative to the largest
 
 
 def cause_at(system: Any, t: Any, q: Any, v: Any) -> str:
@@ -23,8 +23,8 @@ def cause_at(system: Any, t: Any, q: Any, v: Any) -> str:
 def _values(system: Any, t: Any, q: Any, v: Any) -> dict[str, Array]:
     """Return the values of all functions of a system at a state, by name."""
     given = {"t": t, "q": q, "v": v}
-    functions = {name: function for name in FUNCTIONS if (function := getattr(system, name)) is not None}
-    return {name: joined_rows(function(*(given[x] for x in FUNCTIONS[name]))) for name, function in functions.items()}
+    functions = {name: function for name in FUNCTION_ARGUMENTS if (function := getattr(system, name)) is not None}
+    return {name: joined_rows(function(*(given[x] for x in FUNCTION_ARGUMENTS[name]))) for name, function in functions.items()}
 
 
 def cause_of(values: Mapping[str, ArrayLike]) -> str:
@@ -34,7 +34,7 @@ def cause_of(values: Mapping[str, ArrayLike]) -> str:
         return f"{' and '.join(broken)} of the system {'is' if len(broken) == 1 else 'are'} not finite"
     M = np.asarray(values["mass"])
     eigenvalues = np.linalg.eigvalsh((M + M.T) / 2)
-    if not eigenvalues[0] > SINGULAR * np.abs(eigenvalues).max():
+    if not eigenvalues[0] > SINGULAR_TOL * np.abs(eigenvalues).max():
         return (
             f"the mass matrix is not positive definite: its eigenvalues are {eigenvalues[0]:.3g} to {eigenvalues[-1]:.3g}. Add "
             "mass in directions that the constraints fix, such as Psi_q^T Psi_q to M and Psi_q^T gamma to F: the motion stays "

@@ -30,7 +30,7 @@ from udkjax.scene.model import Model
 from udkjax.scene.numbers.number_fields import NumberField
 
 # The functions of a `ConstrainedSystem`, with their arguments.
-ARGUMENTS = {
+FUNCTION_ARGUMENTS = {
     "mass": "(q)",
     "force": "(t, q, v)",
     "constraint": "(t, q)",
@@ -70,7 +70,7 @@ class ConstrainedSystem(PrintsLine, Model):
     v0: Vector | None = eqx.field(converter=number_called("v0", optional=True), default=None)
 
     def __post_init__(self):
-        for name, arguments in ARGUMENTS.items():
+        for name, arguments in FUNCTION_ARGUMENTS.items():
             if (function := getattr(self, name)) is not None:
                 require_function(name, function, arguments)
         if self.q0 is not None and self.v0 is None:

@@ -14,13 +14,13 @@ from functools import cached_property
 
 import numpy as np
 
-from udkjax.equations.programs.differentiable_programs import PROJECTION, DifferentiableProgram
+from udkjax.equations.programs.differentiable_programs import PROJECTION_OUTPUTS, DifferentiableProgram
 from udkjax.equations.systems.system_solver import SystemFactors
 from udkjax.expressions import Graph, Scalar
 from udkjax.expressions.algebra.differential import SparseRow
 from udkjax.expressions.loops.loop_program import ADD, SET, KernelLoop, KernelWriter, LoopProgram, Reset
 
-ONCE = np.zeros((1, 1), int)  # the table of a loop of one iteration
+SINGLE_ITERATION = np.zeros((1, 1), int)  # the table of a loop of one iteration
 WrittenScalars = Mapping[str, Sequence[Scalar]]  # the scalars of each array
 Inputs = Sequence[tuple[Scalar, str, int]]  # with their arrays and indices
 RIGHT, SOLUTION, FACTORS = "right", "x0", "factors"  # arrays; `right1` and `right2` are those of the two corrections
@@ -69,8 +69,8 @@ class DifferentiableSystem:
         self._n = len(of_velocities.mass)
 
     def of(self, *outputs: str) -> DifferentiableProgram:
-        """Return the program of "a", which sets `safe`, or of the `PROJECTION` of a state on the manifold."""
-        if outputs == PROJECTION:
+        """Return the program of "a", which sets `safe`, or of the `PROJECTION_OUTPUTS` of a state on the manifold."""
+        if outputs == PROJECTION_OUTPUTS:
             return self._projection
         assert outputs == ("a",)
         return self._accelerations
@@ -118,7 +118,7 @@ class DifferentiableSystem:
             for name, scalars in arrays.items():
                 for k, s in enumerate(scalars):
                     w.write(s, name, None, k)
-        return KernelLoop(w.kernel(), ONCE)
+        return KernelLoop(w.kernel(), SINGLE_ITERATION)
 
     def _residual(self, equation: SystemEquation, k: int, only_rows: bool = False, **names: str) -> KernelLoop:
         """Return the loop that computes the residual of an equation at the solution `x0`, in the array of the correction k.
@@ -137,7 +137,7 @@ class DifferentiableSystem:
             residual = equation.residual(solution[:n], solution[n:])
         for i, s in enumerate(residual):
             w.write(s, f"{RIGHT}{k}", None, i)
-        return KernelLoop(w.kernel(), ONCE)
+        return KernelLoop(w.kernel(), SINGLE_ITERATION)
 
     def _solve(
         self, factors: SystemFactors, equation: SystemEquation, k: int, to: str, update: str, only_rows: bool = False
@@ -159,7 +159,7 @@ class DifferentiableSystem:
         if only_rows:
             for i, change in enumerate(fixed.correct([*given, *padding], count)):
                 w.write(w.read(to, None, i) - change, f"{to}1", None, i)
-            return KernelLoop(w.kernel(), ONCE)
+            return KernelLoop(w.kernel(), SINGLE_ITERATION)
         change, x = fixed.respond(given[:n], [*given[n:], *padding], count)
         if update == ADD:
             for i, s in enumerate([*change, *x[:count]]):
@@ -167,7 +167,7 @@ class DifferentiableSystem:
         else:
             for i, s in enumerate(change):
                 w.write(w.read(SOLUTION, None, i) + s, to, None, i)
-        return KernelLoop(w.kernel(), ONCE)
+        return KernelLoop(w.kernel(), SINGLE_ITERATION)
 
     def _copy(self, to: str, start: str | None) -> KernelLoop:
         """Return the loop that writes the solution w, or the array `start` minus w, to the array `to`."""
@@ -175,4 +175,4 @@ class DifferentiableSystem:
         for i in range(self._n):
             s = w.read(SOLUTION, None, i)
             w.write(s if start is None else w.read(start, None, i) - s, to, None, i)
-        return KernelLoop(w.kernel(), ONCE)
+        return KernelLoop(w.kernel(), SINGLE_ITERATION)

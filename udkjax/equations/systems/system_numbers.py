@@ -19,8 +19,8 @@ from udkjax.scene.numbers.number_fields import NumberField, split_index
 from udkjax.scene.tables.checks import SceneError
 from udkjax.wording import quote, suggestion
 
-GUESS = ("q0", "v0")  # fields of a system that are numbers themselves
-OWNERS = ("__self__", "kinetic", "force")  # fields through which the functions of a system refer to the user's modules
+GUESS_FIELDS = ("q0", "v0")  # fields of a system that are numbers themselves
+OWNER_FIELDS = ("__self__", "kinetic", "force")  # fields through which the functions of a system refer to the user's modules
 
 
 class NumberPlace(NamedTuple):
@@ -95,11 +95,11 @@ def _places(system: Any) -> Iterator[NumberPlace]:
             continue
         function, *inner = path
         name = getattr(function, "name", "")
-        if name in GUESS:
+        if name in GUESS_FIELDS:
             yield NumberPlace(index, name, name, name, leaf)
         elif inner:
             owner = getattr(system, name)
-            while inner and getattr(inner[0], "name", "") in OWNERS and not _is_of_user(owner):
+            while inner and getattr(inner[0], "name", "") in OWNER_FIELDS and not _is_of_user(owner):
                 owner = getattr(owner, inner.pop(0).name)
             yield NumberPlace(index, name, str(type(owner)), _name_of(inner), leaf)
 

@@ -10,7 +10,7 @@ from functools import cache, cached_property, lru_cache
 
 import numpy as np
 
-from udkjax.equations.systems.system_derivatives import ONCE, DifferentiableSystem, SystemEquation
+from udkjax.equations.systems.system_derivatives import SINGLE_ITERATION, DifferentiableSystem, SystemEquation
 from udkjax.equations.systems.system_solver import SystemFactors, mass_operations
 from udkjax.equations.systems.system_terms import SystemTerms, less
 from udkjax.equations.systems.traced_system import MOST_NUMBERS, SystemFunctions, TracedSystem
@@ -62,7 +62,7 @@ class SystemPrograms(SystemTerms):
         for output in outputs:
             for k, s in enumerate(table[output]()):
                 w.write(s, output.partition(" ")[0], None, k)
-        return LoopProgram([KernelLoop(w.kernel(), ONCE)])
+        return LoopProgram([KernelLoop(w.kernel(), SINGLE_ITERATION)])
 
     def _scalars(self, factors: SystemFactors) -> dict[str, Callable[[], Sequence[Scalar]]]:
         """Return, for each output by name, a function that returns its scalars, with the given factors of linear systems."""

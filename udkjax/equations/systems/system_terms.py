@@ -6,7 +6,7 @@ from functools import cached_property
 import numpy as np
 
 from udkjax.equations.programs.run_programs import RunPrograms
-from udkjax.equations.systems.system_derivatives import ONCE
+from udkjax.equations.systems.system_derivatives import SINGLE_ITERATION
 from udkjax.equations.systems.system_solver import MassFactors, PivotRule, SystemFactors, factorize_mass, factorize_rows
 from udkjax.equations.systems.traced_system import SystemFunctions
 from udkjax.expressions import Scalar, ScalarProgram
@@ -90,7 +90,7 @@ class SystemTerms(RunPrograms):
         change = [w.read("change", None, k) for k in range(self.coordinate_count)]
         for k, s in enumerate(function(self._rows.mass._replace(below=below), change)):
             w.write(s, "change", None, k)
-        return LoopProgram([KernelLoop(w.kernel(), ONCE)])
+        return LoopProgram([KernelLoop(w.kernel(), SINGLE_ITERATION)])
 
     # --- scalars
 

@@ -30,7 +30,7 @@ from udkjax.programs.identity_cache import cached_by_identity, is_concrete
 from udkjax.requirements import ArgumentError, describe, tracing
 from udkjax.scene.model import RunModel
 
-FUNCTIONS = {
+FUNCTION_ARGUMENTS = {
     "mass": "q",
     "force": "tqv",
     "constraint": "tq",
@@ -95,7 +95,7 @@ class SystemFunctions:
         return "\n".join(parts)
 
     def has(self, name: str) -> bool:
-        """Return whether the system has the function `name`, one of `FUNCTIONS`."""
+        """Return whether the system has the function `name`, one of `FUNCTION_ARGUMENTS`."""
         return name in self._functions
 
     @property
@@ -123,7 +123,7 @@ class SystemFunctions:
         known = [np.array([s.constant is None for s in x.flat], dtype).reshape(shape) for x, (shape, dtype) in self._arrays]
         known.append(np.ones(count))
         structs = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in known]
-        state = [self._examples[x] for x in FUNCTIONS["force"]]
+        state = [self._examples[x] for x in FUNCTION_ARGUMENTS["force"]]
         closed = jax.make_jaxpr(lambda *given: force(given[: len(known)], *given[len(known) :]))(*structs, *state)
         constants = [(None, x) for x in closed.consts]
         others = {name: x for name, x in self._functions.items() if name not in ("force", "potential")}
@@ -257,7 +257,7 @@ def trace_system(system: Any, n: int) -> TracedSystem:
     Raises:
         ArgumentError: a function returns an array of another shape than `ConstrainedSystem` says.
     """
-    given = {name: getattr(system, name) for name in FUNCTIONS if getattr(system, name) is not None}
+    given = {name: getattr(system, name) for name in FUNCTION_ARGUMENTS if getattr(system, name) is not None}
     leaves, others = eqx.partition(given, eqx.is_inexact_array)
     listed, tree = jax.tree.flatten(leaves)
     numbers: list[Any] = []
@@ -281,7 +281,7 @@ def trace_system(system: Any, n: int) -> TracedSystem:
             labels[name] = labels_of_rows(name, value)
             return _checked(name, value, n)
 
-        closed = jax.make_jaxpr(function)(*listed, *(examples[x] for x in FUNCTIONS[name]))
+        closed = jax.make_jaxpr(function)(*listed, *(examples[x] for x in FUNCTION_ARGUMENTS[name]))
         is_number = [isinstance(x, Tracer) or eqx.is_inexact_array_like(x) for x in closed.consts]
         constants = [(place(x), None) if yes else (None, x) for x, yes in zip(closed.consts, is_number, strict=True)]
         functions[name] = closed.replace(consts=[None] * len(constants)), constants, of_leaves

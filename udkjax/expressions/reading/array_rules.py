@@ -20,7 +20,7 @@ ArrayRule = Callable[[Graph, ScalarArrays, Any], list[np.ndarray] | None]
 MOST_SORTED = 32  # elements of a sorted row; beyond, comparisons of all pairs are too many
 MOST_PLACES = 256  # places among which an unknown index may choose
 # Reductions by the binary operation of two elements.
-_JOINED = {
+_REDUCTIONS = {
     "reduce_max": lax.max_p,
     "reduce_min": lax.min_p,
     "reduce_prod": lax.mul_p,
@@ -266,7 +266,7 @@ def select_unknown(select: Callable[[ScalarArrays], np.ndarray], array: np.ndarr
 
 
 RULES: dict[str, ArrayRule] = {
-    **{name: partial(_reduce, p) for name, p in _JOINED.items()},
+    **{name: partial(_reduce, p) for name, p in _REDUCTIONS.items()},
     **{name: partial(_accumulate, p) for name, p in _CUMULATIVE.items()},
     "argmax": partial(_first_extreme, lax.gt_p),
     "argmin": partial(_first_extreme, lax.lt_p),

@@ -39,7 +39,7 @@ _INLINED = (
     "remat2",
     "checkpoint",
 )
-POWERS = 20  # powers of two whose sum is exact, also in single precision
+POWERS_AT_ONCE = 20  # powers of two whose sum is exact, also in single precision
 # Positions of the updates and of the indices among the inputs of primitives that put elements into an array.
 _REPLACING: dict[str, Callable[[list[np.ndarray]], tuple[np.ndarray, list[np.ndarray]]]] = {
     "scatter": lambda inputs: (inputs[2], [inputs[1]]),
@@ -150,8 +150,8 @@ def _equation(graph: Graph, equation: Equation, inputs: list[np.ndarray]) -> lis
     if name in _INLINED:
         inner = next(parameters[k] for k in ("jaxpr", "call_jaxpr", "fun_jaxpr") if k in parameters)
         return _read_inner(graph, inner, inputs)
-    if name in _SHAPES:
-        return [np.asarray(_SHAPES[name](*inputs, **parameters), object)]
+    if name in _SHAPE_OPERATIONS:
+        return [np.asarray(_SHAPE_OPERATIONS[name](*inputs, **parameters), object)]
     if name in ("scan", "while"):
         unrolled = unroll(partial(_read_inner, graph), equation, inputs)
         if unrolled is not None:
@@ -260,12 +260,12 @@ def _replace(equation: Equation, inputs: list[np.ndarray]) -> np.ndarray:
 def _add_at(equation: Equation, array: np.ndarray, indices: np.ndarray, updates: np.ndarray) -> np.ndarray:
     """Add the elements of one array to another at constant indices: JAX adds powers of two, whose sums identify the elements."""
     result, dtype = array.copy(), equation.outvars[0].aval.dtype
-    for first in range(0, updates.size, POWERS):
+    for first in range(0, updates.size, POWERS_AT_ONCE):
         powers = np.zeros(updates.size, dtype)
-        powers[first : first + POWERS] = 2.0 ** np.arange(min(POWERS, updates.size - first))
+        powers[first : first + POWERS_AT_ONCE] = 2.0 ** np.arange(min(POWERS_AT_ONCE, updates.size - first))
         zeros, places = np.zeros(array.shape, dtype), _values(indices)
         sums = np.asarray(fold(equation.primitive, equation.params, [zeros, places, powers.reshape(updates.shape)]), np.int64)
-        for k in range(first, min(first + POWERS, updates.size)):
+        for k in range(first, min(first + POWERS_AT_ONCE, updates.size)):
             result[sums >> (k - first) & 1 == 1] += updates.flat[k]
     return result
 
@@ -334,7 +334,7 @@ _ARITHMETIC: dict[str, Callable[..., Scalar]] = {
     "sqrt": lambda a, **_: a.graph.sqrt(a),
     "integer_pow": lambda a, y, **_: _integer_power(a, y),
 }
-_SHAPES: dict[str, Callable[..., np.ndarray]] = {
+_SHAPE_OPERATIONS: dict[str, Callable[..., np.ndarray]] = {
     "reshape": lambda a, new_sizes, **_: a.reshape(new_sizes),
     "squeeze": lambda a, dimensions: np.squeeze(a, tuple(dimensions)),
     "expand_dims": lambda a, dimensions: np.expand_dims(a, dimensions),

@@ -89,7 +89,7 @@ class Scalar:
         return f"{'-' if self.sign < 0 else ''}%{self.index}:{node.kind}{'' if node.detail is None else f'[{node.detail}]'}"
 
 
-_ADDING = Lock()  # kernels of cached graphs are written by several threads, such as those of a sweep
+_ADDING_LOCK = Lock()  # kernels of cached graphs are written by several threads, such as those of a sweep
 
 
 class Graph:
@@ -284,7 +284,7 @@ class Graph:
         key = (kind, tuple([(a.index, a.sign) for a in arguments]), detail, dtype)
         index = self._known.get(key)
         if index is None:
-            with _ADDING:
+            with _ADDING_LOCK:
                 index = self._known.get(key)
                 if index is None:
                     index = len(self.nodes)

@@ -18,13 +18,13 @@ from udkjax.expressions.scalars.graph import Graph, Node, Scalar
 from udkjax.expressions.scalars.selection import absolute, apply, both, floor, where
 
 SIDE = "side"  # the group of the sides among the inputs of a graph
-NEAR = 1e-12  # relative to its terms, g is zero below this
-_OPAQUE = ("while", "cond", "scan")
-_RISING, _FALLING = ("gt", "ge"), ("lt", "le")
-_ONE_SIGNED = (*_RISING, *_FALLING, "max", "min", "abs", "sign")  # without a kink if the sign of their difference is known
+ZERO_TOL = 1e-12  # relative to its terms, g is zero below this
+_OPAQUE_PRIMITIVES = ("while", "cond", "scan")
+_GREATER, _LESS = ("gt", "ge"), ("lt", "le")
+_ONE_SIGNED = (*_GREATER, *_LESS, "max", "min", "abs", "sign")  # without a kink if the sign of their difference is known
 
 
-_KINKED = (*_ONE_SIGNED, *_OPAQUE, "clamp", "atan2", "floor", "ceil", "round", "rem")
+_KINKED = (*_ONE_SIGNED, *_OPAQUE_PRIMITIVES, "clamp", "atan2", "floor", "ceil", "round", "rem")
 
 
 class Leaving(NamedTuple):
@@ -56,7 +56,7 @@ def smooth_pieces(graph: Graph, outputs: Sequence[Scalar], moving: Collection[st
     renewal = _Renewed(graph, moving)
     renewal.hold(outputs)
     nodes = [graph.nodes[i] for i in graph.dependencies([s.index for s in outputs])]
-    opaque = any(n.kind == "call" and n.detail.primitive.name in _OPAQUE and n.depends & set(moving) for n in nodes)
+    opaque = any(n.kind == "call" and n.detail.primitive.name in _OPAQUE_PRIMITIVES and n.depends & set(moving) for n in nodes)
     return Pieces(smooth, held.sides, held.ways, renewal.new_sides, opaque)
 
 
@@ -117,9 +117,9 @@ class _Held:
             return None
         plain = self.graph.again(node, a)
         match name:
-            case _ if name in (*_RISING, *_FALLING):
+            case _ if name in (*_GREATER, *_LESS):
                 side = self._sign(a[0], a[1])
-                return side and self._either(side, plain, _compare(lax.gt_p if name in _RISING else lax.lt_p, side, 0.0))
+                return side and self._either(side, plain, _compare(lax.gt_p if name in _GREATER else lax.lt_p, side, 0.0))
             case "abs" | "sign":
                 side = self._sign(a[0], None)
                 return side and self._either(side, plain, side * a[0] if name == "abs" else side)
@@ -173,7 +173,7 @@ class _Held:
         if key not in self._known:
             size = absolute(a) if b is None else absolute(a) + absolute(b)
             actual = where(_compare(lax.gt_p, g, 0.0), self.graph.constant(1.0), self.graph.constant(-1.0))
-            side = self._new_side(g, actual, _compare(lax.le_p, absolute(g) - size * NEAR, 0.0))
+            side = self._new_side(g, actual, _compare(lax.le_p, absolute(g) - size * ZERO_TOL, 0.0))
             self._known[key] = side, g.sign
             self._leave(side, side * g, -1.0, 0.0)
         side, sign = self._known[key]
@@ -192,7 +192,7 @@ class _Held:
         key = f"whole {u.sign}", u.index
         if key not in self._known:
             distance = absolute(u - floor(u + 0.5))
-            side = self._new_side(u, floor(u), _compare(lax.le_p, distance - (absolute(u) + 1.0) * NEAR, 0.0))
+            side = self._new_side(u, floor(u), _compare(lax.le_p, distance - (absolute(u) + 1.0) * ZERO_TOL, 0.0))
             self._known[key] = side, 1
             self._leave(side, u - side, 1.0, -1.0)
             self._leave(side, side + 1.0 - u, 1.0, 1.0)

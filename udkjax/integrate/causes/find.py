@@ -19,8 +19,8 @@ from udkjax.scene.mechanism import Mechanism
 from udkjax.wording import MOST_LISTED
 
 NEAR_REACH = 1e-2  # fraction of the span by which a run may end before a dead point
-SINGULAR = 1e-4  # bound on singular values of D, with rows of length one, relative to the largest
-RATES = ("vx", "vy", "omega")
+SINGULAR_TOL = 1e-4  # bound on singular values of D, with rows of length one, relative to the largest
+RATE_NAMES = ("vx", "vy", "omega")
 
 
 class FoundCause:
@@ -65,7 +65,7 @@ class FoundCause:
 def find_cause(run: FailedRun) -> str | None:
     """Return the cause of a failed run in words; None if no cause is found that says more than its `Result`."""
     not_finite = " and ".join(
-        text for text in (name_not_finite(run.mechanism, run.q[0]), name_not_finite(run.mechanism, run.v[0], RATES)) if text
+        text for text in (name_not_finite(run.mechanism, run.q[0]), name_not_finite(run.mechanism, run.v[0], RATE_NAMES)) if text
     )
     if not_finite:
         return f"the initial state is not finite: {not_finite}"
@@ -220,7 +220,7 @@ def _shortly_after(run: FailedRun, t: float) -> float:
 def _near_singular(run: FailedRun) -> str:
     """Describe the singular configuration near which the run ended, with its joints; "" if there is none."""
     place = _nearest_singular(run)
-    if place is None or not place[1] < SINGULAR:
+    if place is None or not place[1] < SINGULAR_TOL:
         return ""
     return f"the state is near a singular configuration of {place[0]} (smallest singular value {place[1]:.1g} of the largest)"
 
@@ -243,7 +243,7 @@ def _nearest_singular(run: FailedRun) -> tuple[str, float] | None:
 def _rank(run: FailedRun) -> int:
     t, q, _ = run.states[0]
     sigma = run.decomposed(t, q)[1]
-    return int(np.sum(sigma > SINGULAR * sigma[0]))
+    return int(np.sum(sigma > SINGULAR_TOL * sigma[0]))
 
 
 def explained(

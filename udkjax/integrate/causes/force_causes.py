@@ -5,14 +5,14 @@ import numpy as np
 from udkjax.integrate.causes.element_loads import ElementLoads, TimedState, element_loads
 from udkjax.integrate.causes.failed_run import FailedRun
 
-NEARBY = 1e-9  # fraction of the span: a load changes much within this time only if it jumps
+NEARBY_TIME = 1e-9  # fraction of the span: a load changes much within this time only if it jumps
 # Times after the end of the run at which non-finite numbers are looked for, as fractions of the span: the integrator may have
 # evaluated them in a rejected step up to ten times as long as the last.
 NOT_FINITE_TIMES = (0.0, *np.geomspace(1e-6, 0.1, 80))
-JUMP = 1e-3  # least relative change of a load over `NEARBY` at a jump; smooth loads change a million times less
-PARTS = 8  # number of parts of the way between two states; at a jump, one part has more than half of the change
-GROWN = 1e6  # ratio of a load to its earlier value above which it grows without bound
-STIFF = 0.1  # least rate times step; explicit methods of any order lose stability between 1 and 10
+LEAST_JUMP = 1e-3  # least relative change of a load over `NEARBY_TIME` at a jump; smooth loads change a million times less
+JUMP_PARTS = 8  # number of parts of the way between two states; at a jump, one part has more than half of the change
+GROWTH_RATIO = 1e6  # ratio of a load to its earlier value above which it grows without bound
+STIFF_PRODUCT = 0.1  # least rate times step; explicit methods of any order lose stability between 1 and 10
 
 
 def explain_undefined_law(run: FailedRun) -> str:
@@ -39,22 +39,22 @@ def explain_violent_force(run: FailedRun) -> str:
     scales = run.analysis.scales
     unit = np.tile([float(scales.length), float(scales.length), 1.0], len(q) // 3)
     turn = 1e-6 * max(speed, float(scales.rate)) * unit
-    earlier, later = ((t + sign * NEARBY * span, q + sign * NEARBY * span * v, v) for sign in (-1, 1))
+    earlier, later = ((t + sign * NEARBY_TIME * span, q + sign * NEARBY_TIME * span * v, v) for sign in (-1, 1))
     slower, faster = (t, q, v - turn), (t, q, v + turn)
     loads = _loads(run, [earlier, (t, q, v), later, slower, faster, *run.states[1:][::-1][:2]])
     size, names = np.nan_to_num(loads.size, nan=0.0, posinf=1e300), loads.names
     before, now = size[5:].max(0, initial=0.0), size[1]
     slow = max(float(scales.rate), 1 / span) ** 2
     for k, name in enumerate(names):
-        if now[k] > GROWN * max(before[k], slow):
+        if now[k] > GROWTH_RATIO * max(before[k], slow):
             return f'force "{name}" grows without bound: here it is {now[k] / max(before[k], slow):.1g} times what it was'
     largest = size.max(0)
     # A load may jump with time, or with velocity.
     time_jump, speed_jump = _jumps(run, earlier, later), _jumps(run, slower, faster)
     for k, name in enumerate(names):
-        if time_jump[k] > JUMP * max(largest[k], slow):
+        if time_jump[k] > LEAST_JUMP * max(largest[k], slow):
             return f'force "{name}" jumps at {t:.6g} s: give its `breakpoints`, smooth it, or make the jump an event'
-        if speed_jump[k] > JUMP * max(largest[k], slow) and speed_jump[k] > 0.5 * largest[k]:
+        if speed_jump[k] > LEAST_JUMP * max(largest[k], slow) and speed_jump[k] > 0.5 * largest[k]:
             return f'force "{name}" jumps with the velocity: smooth it over a small speed, as `Friction` does'
     return ""
 
@@ -64,7 +64,7 @@ def _jumps(run: FailedRun, first: TimedState, last: TimedState) -> np.ndarray:
 
     A jump changes the load within one of several parts of the way; a smooth load, however steep, in all of them.
     """
-    shares = np.linspace(0.0, 1.0, PARTS + 1)
+    shares = np.linspace(0.0, 1.0, JUMP_PARTS + 1)
     states = [
         (first[0] + x * (last[0] - first[0]), *((1 - x) * a + x * b for a, b in zip(first[1:], last[1:], strict=True)))
         for x in shares
@@ -85,7 +85,7 @@ def explain_stiff_force(run: FailedRun) -> str:
     damping, stiffness = loads.damping[0], loads.stiffness[0]
     k = int(np.argmax(np.maximum(damping, stiffness)))
     rate, verb = (damping[k], "damps") if damping[k] >= stiffness[k] else (stiffness[k], "swings")
-    if not STIFF < rate * step < 1 / STIFF**2:
+    if not STIFF_PRODUCT < rate * step < 1 / STIFF_PRODUCT**2:
         return ""
     return (
         f'force "{loads.names[k]}" {verb} at a rate of {rate:.2g} 1/s, which limits an explicit solver to steps of {step:.2g} s: '

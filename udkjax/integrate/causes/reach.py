@@ -19,9 +19,9 @@ REACH_STEPS = 32  # number of steps from the last good state to the time of the 
 REACH_HALVINGS = 34  # bisections of the failing step: to 2e-12 of the time to the failure
 DEAD_POINT_TOL = 1e-2  # relative to the largest singular value of D: smaller ones belong to the dead point, found to 1e-5 or so
 INVOLVED_SHARE = 1e-3  # relative to the largest row of a combination: smaller rows are not involved
-IN_LINE = 1e-3  # (rad)
+IN_LINE_TOL = 1e-3  # (rad)
 STATES_TRIED = 4  # states to start from
-SAME_BRANCH = 1.0  # in rad and characteristic lengths: larger changes lead to another branch
+SAME_BRANCH_DISTANCE = 1.0  # in rad and characteristic lengths: larger changes lead to another branch
 
 
 class Reach(NamedTuple):
@@ -71,7 +71,7 @@ def _find_reach(run: FailedRun, until: float) -> Reach | None:
         guess = q if before is None else q + (q - before[1]) * (at - t) / (t - before[0])
         for start in (guess, q):
             p = rows.close(at, start)
-            if p is not None and size(p.q - q, np) < SAME_BRANCH:
+            if p is not None and size(p.q - q, np) < SAME_BRANCH_DISTANCE:
                 return p.q
         return None
 
@@ -133,7 +133,7 @@ def dead_point(mechanism: Mechanism, found: Reach, drivers: list[str]) -> str:
             (middle,) = shared
             chain = [*({a, b} - shared), middle, *(set(ends) - shared)]
             u, w = position_of(chain[1]) - position_of(chain[0]), position_of(chain[2]) - position_of(chain[1])
-            if abs(u[0] * w[1] - u[1] * w[0]) <= IN_LINE * np.linalg.norm(u) * np.linalg.norm(w):
+            if abs(u[0] * w[1] - u[1] * w[0]) <= IN_LINE_TOL * np.linalg.norm(u) * np.linalg.norm(w):
                 lines.append(chain if index[link] < index[other] else chain[::-1])
     if lines:
         return "dead point: " + " and ".join(f"pins {', '.join(line)} in line" for line in lines)

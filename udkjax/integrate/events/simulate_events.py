@@ -34,7 +34,7 @@ from udkjax.integrate.events.law.event import (
     listed_events,
 )
 from udkjax.integrate.events.law.event_plan import event_plan
-from udkjax.integrate.events.law.kinks import FREE, renewed_sides, with_held_forces
+from udkjax.integrate.events.law.kinks import FREE_SIDE, renewed_sides, with_held_forces
 from udkjax.integrate.events.law.phases import SCENE, Phases, events_and_phases
 from udkjax.integrate.events.run.condition_program import watched_conditions, with_cached_functions
 from udkjax.integrate.events.run.host_run import HostRun, concrete_plan, event_arrays
@@ -52,7 +52,7 @@ from udkjax.programs.identity_cache import cached_by_identity, is_concrete
 from udkjax.transforms.gradients import stop_gradients
 from udkjax.wording import quote
 
-UNRESOLVED = "conditions of events vary too quickly for the shortest window, 1e-9 T; crossings may be missed: {}"
+UNRESOLVED_WARNING = "conditions of events vary too quickly for the shortest window, 1e-9 T; crossings may be missed: {}"
 
 
 class Given(NamedTuple):
@@ -116,7 +116,7 @@ def simulate_events(
     names = tuple(e.name for e in listed if e.action.turn is None)
     if np.isfinite(found.unresolved[: len(names)]).any():
         fast = [f"{quote(name)} from {t:.6g} s on" for name, t in zip(names, found.unresolved) if np.isfinite(t)]
-        warnings.warn(UNRESOLVED.format(", ".join(fast)), stacklevel=3)
+        warnings.warn(UNRESOLVED_WARNING.format(", ".join(fast)), stacklevel=3)
     return put_arrays(_solution(mechanism, given, found, reasons, np)), end
 
 
@@ -216,7 +216,7 @@ def _run(given: Given) -> tuple[EventRun, tuple[str, ...]]:
 
 def _first_sides(phases: Phases, problem: Problem) -> Float[Array, "S"]:
     """Return all sides (kinks.py) at the start: of the comparisons in forces, and zeros for joints that may stick."""
-    of_kinks = jnp.full(sum(held.smooth.count for held in phases.held), FREE)
+    of_kinks = jnp.full(sum(held.smooth.count for held in phases.held), FREE_SIDE)
     free = jnp.concatenate([jnp.zeros(SIDES * len(phases.sticking)), of_kinks])
     at = problem.ts[0], problem.q, problem.v, free
     return stop_gradients(renewed_sides(phases.held, phases.mechanisms[SCENE], *at))

@@ -19,7 +19,7 @@ from udkjax.integrate.events.law.event import ExpandsToEvents
 from udkjax.integrate.native_engine import packed
 from udkjax.integrate.portable.parameters import NumberProgram, guess_of, places_of_numbers, scalar_parameters
 from udkjax.integrate.portable.portable_events import PortableEvents
-from udkjax.integrate.portable.pull import PREFIX, with_pulls
+from udkjax.integrate.portable.pull import PULL_PREFIX, with_pulls
 from udkjax.integrate.prepare import AUTO, DRIFT_PROJECTED, Choices, prepare_run
 from udkjax.integrate.problem import Problem
 from udkjax.integrate.projection import Projection
@@ -34,7 +34,7 @@ from udkjax.scene.elements.bodies import GROUND
 from udkjax.scene.elements.friction import Friction
 from udkjax.scene.mechanism import Mechanism
 
-FORMAT = 2  # of the data, which engine.js reads
+DATA_FORMAT = 2  # of the data, which engine.js reads
 STEPS_OF_A_PAGE = 20_000  # largest number of steps of a run in a page: with more the page would not respond for seconds
 
 
@@ -97,7 +97,7 @@ def portable_engine(
 
     numbers = NumberProgram(mechanism, values, lambda given: watched.mechanism(with_own(given)), further)
     data: JsonObject = {
-        "format": FORMAT,
+        "format": DATA_FORMAT,
         "bodies": list(mechanism.body_names),
         "parameters": [{"name": name, "unit": mechanism.unit_of(name), "value": x} for name, x in values.items()],
         "numbers": floats(numbers.base),
@@ -182,7 +182,7 @@ def _places(mechanism: Mechanism, pull: bool) -> JsonObject:
     """Return the entries `guess`, `pulls` and `masses` of the data: places in the vector of all numbers."""
     places = places_of_numbers(mechanism)
     guess = guess_of(places)
-    pulls = [places.forces[PREFIX + name] for name in places.body_names] if pull else []
+    pulls = [places.forces[PULL_PREFIX + name] for name in places.body_names] if pull else []
     held = [[*e.point.tolist(), *e.target.tolist(), int(e.stiffness), int(e.damping)] for e in pulls]
     masses = [[int(body.mass), int(body.inertia)] for body in places.bodies.values()]
     return {"guess": {x: y.tolist() for x, y in guess.items()}, "pulls": held, "masses": masses}

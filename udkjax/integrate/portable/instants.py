@@ -21,8 +21,8 @@ from jaxtyping import Array, Bool, Float, Int
 from udkjax.integrate.events.instant.listing import listing
 from udkjax.integrate.events.instant.loop import begin, settle
 from udkjax.integrate.events.instant.runs import (
-    BEGIN,
-    RECORD,
+    AT_START,
+    RECORD_FIELDS,
     Change,
     EventRun,
     MemberIndices,
@@ -39,8 +39,8 @@ from udkjax.integrate.events.run.added_joints import AddedJoint
 from udkjax.integrate.events.run.phase_code import ValuesLayout
 
 # The parts of a run that an instant changes, `joints` one after another; and of its record only what the next event needs.
-CHANGED = "t q v phase joints event sides scale carried running code undefined".split()
-LAST = "event_time", "event_index", "closed"
+CHANGED_FIELDS = "t q v phase joints event sides scale carried running code undefined".split()
+LAST_EVENT_FIELDS = "event_time", "event_index", "closed"
 
 
 @dataclass(frozen=True)
@@ -73,14 +73,14 @@ class Instants:
         numbers = sum(len(joint.program.inputs) - n for joint in self.added)
         of_state = {"t": (), "q": (n,), "v": (n,), "phase": (C,), "joints": (sum(self.widths),), "event": (), "sides": (2 * E,)}
         of_state |= {"scale": (E,), "carried": (E,), "running": (), "code": (), "undefined": (E,)}
-        of_state |= {f"last_{name}": (E,) if name == "closed" else () for name in LAST}
+        of_state |= {f"last_{name}": (E,) if name == "closed" else () for name in LAST_EVENT_FIELDS}
         constant = {"end": (), "rate": (), "coordinates": (n,), "inverse_mass": (n,)}
         return of_state | constant | {"of_actions": (len(NUMBERS_OF_ACTIONS), E), "joint_numbers": (numbers,)}
 
     @property
     def starts(self) -> dict[str, list[float]]:
         """The values of those inputs that are not zero at the start of a run, by name."""
-        return {"event": [float(BEGIN)], "running": [1.0], "phase": [float(x) for x in self.plan.first]} | {
+        return {"event": [float(AT_START)], "running": [1.0], "phase": [float(x) for x in self.plan.first]} | {
             "last_event_index": [-1.0]
         }
 
@@ -101,23 +101,23 @@ class Instants:
         before = runs_before(plan, state, 0, jnp.round(given["code"][None]).astype(int), jnp)
         integers = {name: jnp.round(given[name][None]).astype(int) for name in ("event", "sides")}
         masks = {name: given[name][None] > 0.5 for name in ("carried", "running", "undefined")}
-        last = {name: given[f"last_{name}"] for name in LAST}
-        record: dict[str, Any] = dict(zip(RECORD, before.record, strict=True))
+        last = {name: given[f"last_{name}"] for name in LAST_EVENT_FIELDS}
+        record: dict[str, Any] = dict(zip(RECORD_FIELDS, before.record, strict=True))
         record |= {name: record[name].at[0, 0].set(x.astype(record[name].dtype)) for name, x in last.items()}
         before = before._replace(
             **integers, **masks, scale=given["scale"][None], count=jnp.ones(1, int), record=tuple(record.values())
         )
         after = apply(InstantMotion(self, host, given), before)
-        record = dict(zip(RECORD, after.record, strict=True))
-        of_state = {name: getattr(after, name)[0].astype(float) for name in CHANGED if name != "joints"}
+        record = dict(zip(RECORD_FIELDS, after.record, strict=True))
+        of_state = {name: getattr(after, name)[0].astype(float) for name in CHANGED_FIELDS if name != "joints"}
         of_state["joints"] = jnp.concatenate([x[0] for x in after.joints])
-        of_state |= {f"last_{name}": record[name][0, after.count[0] - 1].astype(float) for name in LAST}
+        of_state |= {f"last_{name}": record[name][0, after.count[0] - 1].astype(float) for name in LAST_EVENT_FIELDS}
         watched = plan.watched(after.phase, after.carried, jnp)[0].astype(float)
         return of_state | {"watched": watched} | self._listed(before, after)
 
     def _listed(self, before: MemberRuns, after: MemberRuns) -> dict[str, Array]:
         """Return the events of the instant as `listing` lists them: number, indices of their names, times, and states before."""
-        of_instant = {name: x[0, 1:] for name, x in zip(RECORD, after.record, strict=True)}
+        of_instant = {name: x[0, 1:] for name, x in zip(RECORD_FIELDS, after.record, strict=True)}
         others = dict.fromkeys(EventRun._fields) | {
             "count": after.count[0] - 1,
             "unresolved": jnp.zeros(self.plan.count),

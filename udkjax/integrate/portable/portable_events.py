@@ -13,7 +13,7 @@ from udkjax.equations.rows.analysis import Analysis, analyse
 from udkjax.equations.terms import switches as switching
 from udkjax.integrate.events.instant.listing import names_of_events
 from udkjax.integrate.events.law.actions import numbers_of_actions
-from udkjax.integrate.events.law.crossings import NO_EVENT, ZERO, zero_of
+from udkjax.integrate.events.law.crossings import NO_EVENT, ZERO_TOL, zero_of
 from udkjax.integrate.events.law.event import Event, ExpandsToEvents, expand_events
 from udkjax.integrate.events.law.event_plan import EventPlan, event_plan
 from udkjax.integrate.events.law.kinks import places_of_sides
@@ -21,7 +21,7 @@ from udkjax.integrate.events.law.phases import Phases, events_and_phases
 from udkjax.integrate.events.run.added_joints import added_joints, joint_numbers, places_of_joints
 from udkjax.integrate.events.run.condition_program import condition_numbers, watched_conditions, with_forces
 from udkjax.integrate.events.run.phase_code import ValuesLayout
-from udkjax.integrate.portable.instants import CHANGED, LAST, Instants
+from udkjax.integrate.portable.instants import CHANGED_FIELDS, LAST_EVENT_FIELDS, Instants
 from udkjax.integrate.solution import Result
 from udkjax.native.language.program import UnsupportedError
 from udkjax.native.operations import EvaluateEvents, StateOperation
@@ -31,12 +31,12 @@ from udkjax.scene.mechanism import Mechanism
 
 MOST_EVENTS = 1000  # largest number in a run of a page; nobody would look at more
 # Why a run ends at an event; those that are not here have an event's name on the page, or go on.
-WORDS = {
+END_REASONS = {
     Result.beyond_contact: "it begins beyond a contact",
     Result.event_impossible: "the constraints allow no impulse, or no friction obeys its law",
     Result.painleve_paradox: "no forces of the contacts obey the law of friction (Painleve's paradox)",
 }
-NAMED = Result.successful, Result.event_stop, Result.at_rest, Result.undefined_condition
+PAGE_RESULTS = Result.successful, Result.event_stop, Result.at_rest, Result.undefined_condition
 
 
 def names_of_run(mechanism: Mechanism, events: Sequence[Event]) -> tuple[str, ...]:
@@ -136,11 +136,11 @@ class PortableEvents:
         watched = [*range(plan.count), *(plan.count + k for k, row in enumerate(switches.rows) if row >= 0)]
         return {
             "names": names_of_events(self.events, phases),
-            "kept": [*(x for x in CHANGED if x not in ("t", "q", "v")), *(f"last_{x}" for x in LAST)],
+            "kept": [*(x for x in CHANGED_FIELDS if x not in ("t", "q", "v")), *(f"last_{x}" for x in LAST_EVENT_FIELDS)],
             "watched": watched,
             "directions": plan.both_directions[watched].tolist(),
             "zeros": zero_of(plan.slides, np.array([atol]), np).tolist(),
-            "zero": ZERO,
+            "zero": ZERO_TOL,
             "slowest": float(self.analysis.scales.rate),
             "most": MOST_EVENTS,
             "head": Conditions.head,
@@ -150,6 +150,6 @@ class PortableEvents:
             "sticking": {x.name: [int(lock), len(places) - plan.side_count + x.first + 1] for x, lock in locks},
             "starts": instants.starts,
             "no_event": NO_EVENT,
-            "results": {x.name: int(x) for x in NAMED},
-            "words": {int(result): words for result, words in WORDS.items()},
+            "results": {x.name: int(x) for x in PAGE_RESULTS},
+            "words": {int(result): words for result, words in END_REASONS.items()},
         }

@@ -9,7 +9,7 @@ from udkjax.scene.elements.fields import NOT_NEGATIVE, given_number
 from udkjax.scene.elements.forces import ForceElement, Wrench
 from udkjax.scene.mechanism import Mechanism
 
-PREFIX = "pull of "  # prefix of the names of the elements
+PULL_PREFIX = "pull of "  # prefix of the names of the elements
 
 
 class Pull(ForceElement):
@@ -45,6 +45,6 @@ class Pull(ForceElement):
 def with_pulls(mechanism: Mechanism) -> Mechanism:
     """Return the mechanism with a further force element for each body: a `Pull` without stiffness."""
     none = {"point": np.zeros(2), "target": np.zeros(2), "stiffness": 0.0, "damping": 0.0}
-    pulls = {PREFIX + name: Pull(bodies=(name,), **none) for name in mechanism.body_names}
+    pulls = {PULL_PREFIX + name: Pull(bodies=(name,), **none) for name in mechanism.body_names}
     forces = {**mechanism.forces, **pulls}
     return Mechanism(mechanism.bodies, mechanism.joints, mechanism.drivers, forces, mechanism.gravity, mechanism.name)

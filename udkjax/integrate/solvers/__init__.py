@@ -15,12 +15,12 @@ if TYPE_CHECKING:
 
 Solver: TypeAlias = "diffrax.AbstractSolver"
 StepController: TypeAlias = "diffrax.AbstractStepSizeController"
-OWN = {"Adams": "adams", "BDF": "bdf", "Verner65": "verner"}  # the solvers of this folder, with their modules
+OWN_SOLVERS = {"Adams": "adams", "BDF": "bdf", "Verner65": "verner"}  # the solvers of this folder, with their modules
 
 
 def own_solver(name: str) -> "type[diffrax.AbstractSolver]":
     """Return the class of a solver of this package; raise KeyError for any other name."""
-    return getattr(import_module(f"udkjax.integrate.solvers.{OWN[name]}"), name)
+    return getattr(import_module(f"udkjax.integrate.solvers.{OWN_SOLVERS[name]}"), name)
 
 
 def solver_named(name: str) -> "diffrax.AbstractSolver":
@@ -31,9 +31,11 @@ def solver_named(name: str) -> "diffrax.AbstractSolver":
     """
     import diffrax
 
-    solver = own_solver(name) if name in OWN else getattr(diffrax, name, None)
+    solver = own_solver(name) if name in OWN_SOLVERS else getattr(diffrax, name, None)
     if not (isinstance(solver, type) and issubclass(solver, diffrax.AbstractSolver)):
-        raise ValueError(f"{name!r} is not a solver: take one of {', '.join(OWN)}, or a solver of diffrax such as 'Dopri8'")
+        raise ValueError(
+            f"{name!r} is not a solver: take one of {', '.join(OWN_SOLVERS)}, or a solver of diffrax such as 'Dopri8'"
+        )
     return solver()
 
 

@@ -16,10 +16,15 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from udkjax.annotations import Vector
-from udkjax.integrate.solvers.divided_differences import HIGHEST, DifferenceInterpolation, StepCoefficients, step_coefficients
+from udkjax.integrate.solvers.divided_differences import (
+    HIGHEST_ORDER,
+    DifferenceInterpolation,
+    StepCoefficients,
+    step_coefficients,
+)
 from udkjax.integrate.solvers.multistep import (
     LOST_STEP,
-    STRICTER,
+    STRICTNESS,
     Flag,
     Multistep,
     Tolerances,
@@ -39,16 +44,16 @@ ITERATION_SHARE = 0.1  # CORTES: largest remaining error of the iteration, relat
 RATE_MEMORY = 0.3  # CRDOWN: largest decrease of the rate of convergence in an iteration, since one fast iteration proves little
 # Choice of order and step, as in STEP (Shampine, Gordon 1975, chapter 10): a step at most doubles. Order one has less reliable
 # estimates: the order changes from or to one only if this halves the error.
-LARGEST = 2.0
+LARGEST_FACTOR = 2.0
 HALF = 0.5
 # Constants of this package: with these the error of many steps is a small multiple of the tolerance, with no more right-hand
 # sides than STEP or VODE (tests/integrate/solvers/test_adams.py).
-SHARE = 0.25  # target error of the next step, relative to the tolerance; 0.5 in STEP, whose steps only halve or double
-RUNGS = 4.0  # a step changes by powers of 2^(1/4), to be independent of rounding errors of the estimate
-SMALLEST = 0.25  # smallest factor of a step; STEP halves once or twice
+TARGET_ERROR = 0.25  # target error of the next step, relative to the tolerance; 0.5 in STEP, whose steps only halve or double
+FACTORS_PER_DOUBLING = 4.0  # a step changes by powers of 2^(1/4), to be independent of rounding errors of the estimate
+SMALLEST_FACTOR = 0.25  # smallest factor of a step; STEP halves once or twice
 NEGLIGIBLE = 1e-4  # relative to the tolerance: smaller estimates are rounding errors
-EVEN = 1e-2  # relative: steps that differ by less are equal
-SAME_STATE = 1e-14  # relative: compiled code may compute the same state twice with different rounding
+EQUAL_STEPS_TOL = 1e-2  # relative: steps that differ by less are equal
+SAME_STATE_TOL = 1e-14  # relative: compiled code may compute the same state twice with different rounding
 TINY = 1e-300  # replaces an error of zero in a quotient
 
 
@@ -98,10 +103,11 @@ def choose_order(
         The state after the step, and the growth factor of the step.
     """
     k, e = control.order, errors
-    equal_steps = jnp.where(jnp.abs(h - control.step) < EVEN * h, control.equal_steps + 1, 1)
+    equal_steps = jnp.where(jnp.abs(h - control.step) < EQUAL_STEPS_TOL * h, control.equal_steps + 1, 1)
     falling = jnp.where(k > 2, jnp.maximum(e.k_minus_1, e.k_minus_2) <= e.k, (k == 2) & (e.k_minus_1 <= HALF * e.k))
     falling = falling & (e.k > NEGLIGIBLE)
-    shrunk = (h < (1 - EVEN) * control.step) & (points > 2)  # rejected before, except for the first step, which is a guess
+    # A shorter step was rejected before, except for the first step, which is a guess.
+    shrunk = (h < (1 - EQUAL_STEPS_TOL) * control.step) & (points > 2)
     starting = control.starting & ~shrunk & ~falling & (k < most)
 
     reliable = (equal_steps > k) & (points >= k + 2)
@@ -111,14 +117,16 @@ def choose_order(
     down = down & ~up & (k > least)
     order = k + up - down
     error = jnp.where(down, e.k_minus_1, jnp.where(up & reliable, e.k_plus_1, e.k))
-    growth = jnp.where(starting, LARGEST, jnp.maximum(step_factor(error, order), 1.0))
+    growth = jnp.where(starting, LARGEST_FACTOR, jnp.maximum(step_factor(error, order), 1.0))
     return OrderControl(order, h * growth, equal_steps, starting), growth
 
 
 def step_factor(error: Float[Array, ""], order: Int[Array, ""]) -> Float[Array, ""]:
     """Return the factor for the step after one with this error, relative to the tolerance, by a method of this order."""
-    factor = (SHARE / jnp.maximum(error, TINY)) ** (1 / (order + 1))
-    return 2 ** (jnp.floor(RUNGS * jnp.log2(jnp.clip(factor, SMALLEST, LARGEST))) / RUNGS)
+    factor = (TARGET_ERROR / jnp.maximum(error, TINY)) ** (1 / (order + 1))
+    return 2 ** (
+        jnp.floor(FACTORS_PER_DOUBLING * jnp.log2(jnp.clip(factor, SMALLEST_FACTOR, LARGEST_FACTOR))) / FACTORS_PER_DOUBLING
+    )
 
 
 # --- the solver
@@ -162,14 +170,14 @@ class Adams(Multistep):
 
     corrector: Literal["pece", "iteration"] = eqx.field(default="pece", static=True)
     min_order: int = eqx.field(default=1, static=True)
-    max_order: int = eqx.field(default=HIGHEST, static=True)
+    max_order: int = eqx.field(default=HIGHEST_ORDER, static=True)
     root_finder: Tolerances = eqx.field(default_factory=tolerances_from_controller)
     root_find_max_steps: int = eqx.field(default=ITERATIONS, static=True, converter=count_called("root_find_max_steps"))
 
     interpolation_cls: ClassVar[Callable[..., DifferenceInterpolation]] = DifferenceInterpolation
 
     def __check_init__(self):
-        check_orders(self.min_order, self.max_order, HIGHEST)
+        check_orders(self.min_order, self.max_order, HIGHEST_ORDER)
         if self.corrector not in ("pece", "iteration"):
             raise ValueError(f'corrector must be "pece" or "iteration", not {self.corrector!r}')
 
@@ -211,7 +219,7 @@ class Adams(Multistep):
         phi = jnp.where(row <= points, phi, 0.0)
         errors = ErrorEstimates(lowest, lower, same, estimates.errors[k + 1] * size(phi[k + 1][None])[0])
         control, growth = choose_order(state.control, estimates.h, points, errors, self.min_order, self.max_order)
-        shrink = jnp.where(found & finite, step_factor(error, k), SMALLEST)
+        shrink = jnp.where(found & finite, step_factor(error, k), SMALLEST_FACTOR)
 
         ages = jnp.concatenate([jnp.zeros_like(state.ages[:1]), h + state.ages[:-1]])
         exact = repeats | (self.corrector == "iteration")
@@ -244,7 +252,7 @@ class Adams(Multistep):
         A displaced y, as after a projection, is not the end of the last step. It will be displaced again after this step, so that
         evaluating f at its end is left to the next step.
         """
-        displaced = jnp.max(jnp.abs(y - state.y), initial=0.0) > SAME_STATE * jnp.max(jnp.abs(y), initial=0.0)
+        displaced = jnp.max(jnp.abs(y - state.y), initial=0.0) > SAME_STATE_TOL * jnp.max(jnp.abs(y), initial=0.0)
         stale = displaced | ~state.exact | made_jump
         value = jax.lax.cond(stale, lambda: f(t0, y), lambda: state.phi[0])
         calls = state.evaluations + stale
@@ -288,5 +296,5 @@ def _sizes(tolerances: Tolerances, unravel: Unravel, y0: PyTree, y1: PyTree) -> 
     """Return a function that computes the norms of the rows of a matrix, relative to the tolerance of a step."""
     tolerances, y0, y1 = stop_gradients((tolerances, y0, y1))
     allowed = error_scale(tolerances, y0, y1)
-    size = jax.vmap(lambda x: STRICTER * tolerances.norm(jax.tree.map(jnp.divide, unravel(x), allowed)))
+    size = jax.vmap(lambda x: STRICTNESS * tolerances.norm(jax.tree.map(jnp.divide, unravel(x), allowed)))
     return lambda rows: size(stop_gradients(rows))

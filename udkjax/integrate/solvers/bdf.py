@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from udkjax.integrate.solvers import newton
 from udkjax.integrate.solvers.multistep import (
     LOST_STEP,
-    STRICTER,
+    STRICTNESS,
     Flag,
     Multistep,
     Tolerances,
@@ -30,20 +30,20 @@ from udkjax.transforms.gradients import stop_gradients
 
 Terms = PyTree[diffrax.AbstractTerm]
 
-HIGHEST = 5  # order six is of little use, and order seven unstable (Hairer, Wanner II, section V.1)
+HIGHEST_ORDER = 5  # order six is of little use, and order seven unstable (Hairer, Wanner II, section V.1)
 # Constants of VODE (Brown, Byrne, Hindmarsh, SIAM J. Sci. Stat. Comput. 10 (1989) 1038), with its names.
-WORTHWHILE = 1.5  # THRESH: least growth of a step; while the step is constant, M can be reused and the error estimates are good
-LARGEST, SMALLEST = 10.0, 0.2  # ETAMX3, ETAMXF: factors of a step, the defaults of diffrax.PIDController
+LEAST_GROWTH = 1.5  # THRESH: least growth of a step; while the step is constant, M can be reused and the error estimates are good
+LARGEST_FACTOR, SMALLEST_FACTOR = 10.0, 0.2  # ETAMX3, ETAMXF: factors of a step, the defaults of diffrax.PIDController
 NO_DIVISION_BY_ZERO = 1e-6  # ADDON
 # Ratio of the tolerance to the estimated error of the next step at orders k - 1, k and k + 1 (BIAS1, BIAS2, BIAS3: 6, 6, 10), in
-# addition to STRICTER; and the fraction of the error that an iteration may leave (CORTES: 0.1). The numbers in brackets
+# addition to STRICTNESS; and the fraction of the error that an iteration may leave (CORTES: 0.1). The numbers in brackets
 # are those of VODE. With the values below, the error of many steps is a small multiple of the tolerance, and the same error needs
 # no more right-hand sides than with VODE (tests/integrate/solvers/test_bdf.py).
-LOWER, SAME, HIGHER = 10.0, 10.0, 15.0
+LOWER_ORDER_BIAS, SAME_ORDER_BIAS, HIGHER_ORDER_BIAS = 10.0, 10.0, 15.0
 NEWTON_SHARE = 0.02
 # Constants of this package.
-BETTER = 1.1  # the order changes only if this allows a step larger by this factor
-REPEATED = 1e-3  # relative: a step smaller than planned by more than this was rejected before
+ORDER_CHANGE_GAIN = 1.1  # the order changes only if this allows a step larger by this factor
+RETRY_TOL = 1e-3  # relative: a step smaller than planned by more than this was rejected before
 
 
 class BDFState(eqx.Module):
@@ -124,7 +124,7 @@ class BDF(Multistep):
         root_find_max_steps: largest number of Newton iterations of a step.
     """
 
-    max_order: int = eqx.field(default=HIGHEST, static=True)
+    max_order: int = eqx.field(default=HIGHEST_ORDER, static=True)
     min_order: int = eqx.field(default=1, static=True)
     root_finder: Tolerances = eqx.field(default_factory=tolerances_from_controller)
     root_find_max_steps: int = eqx.field(default=newton.ITERATIONS, static=True, converter=count_called("root_find_max_steps"))
@@ -132,7 +132,7 @@ class BDF(Multistep):
     interpolation_cls: ClassVar = BDFInterpolation
 
     def __check_init__(self):
-        check_orders(self.min_order, self.max_order, HIGHEST)
+        check_orders(self.min_order, self.max_order, HIGHEST_ORDER)
 
     def order(self, terms):
         return self.max_order
@@ -164,7 +164,7 @@ class BDF(Multistep):
         t0, t1 = jnp.asarray(t0), jnp.asarray(t1)
         tolerances, h = stop_gradients(self.root_finder), t1 - t0
         state = self._history(terms, t0, t1, y0, args, solver_state, made_jump)
-        retried = h < (1 - REPEATED) * state.planned
+        retried = h < (1 - RETRY_TOL) * state.planned
         k = jnp.where(h < LOST_STEP * state.planned, 1, state.order)
 
         psi = t1 - state.times  # p and its derivative at t1, from the first k + 1 rows
@@ -176,7 +176,9 @@ class BDF(Multistep):
         gamma = jnp.cumsum(1 / (1.0 + i))[k - 1]
         error = _error_constant(k, h / psi)
 
-        size = _Size(tolerances.norm, unravel, ravel_pytree(error_scale(tolerances, y0, y0))[0], STRICTER * error / NEWTON_SHARE)
+        size = _Size(
+            tolerances.norm, unravel, ravel_pytree(error_scale(tolerances, y0, y0))[0], STRICTNESS * error / NEWTON_SHARE
+        )
         equation = newton.Implicit(terms, args, unravel, t1, predicted, v, h / gamma)
         e, converged, iteration = newton.solve(equation, stop_gradients(size), state.newton, self.root_find_max_steps)
         e = jnp.where(converged, e, 0.0)
@@ -186,11 +188,11 @@ class BDF(Multistep):
         phi = signs @ terms_at_t1 + e
         y1 = unravel(phi[0])
 
-        weighed = _Size(tolerances.norm, unravel, ravel_pytree(error_scale(tolerances, y0, y1))[0], STRICTER)
+        weighed = _Size(tolerances.norm, unravel, ravel_pytree(error_scale(tolerances, y0, y1))[0], STRICTNESS)
         errors = stop_gradients(_errors(k, h / psi, phi, weighed).at[1].set(error * weighed(e)))
         accept = converged & (errors[1] <= 1)
         factor, order, wait = self._choose(k, errors, state.wait, retried)
-        shrink = jnp.minimum(_factor(errors[1], k, SAME), jnp.where(retried, SMALLEST, 1.0))
+        shrink = jnp.minimum(_factor(errors[1], k, SAME_ORDER_BIAS), jnp.where(retried, SMALLEST_FACTOR, 1.0))
         points = jnp.minimum(state.points + 1, self.max_order + 1)
         order = jnp.maximum(order, jnp.minimum(self.min_order, points))
         times = jnp.concatenate([t1[None], state.times[:-1]])
@@ -238,14 +240,14 @@ class BDF(Multistep):
         orders = k + jnp.array([-1, 0, 1])
         wait = wait - 1
         due = (wait <= 0) & ~retried
-        factors = _factor(errors, orders, jnp.array([LOWER, SAME, HIGHER]))
+        factors = _factor(errors, orders, jnp.array([LOWER_ORDER_BIAS, SAME_ORDER_BIAS, HIGHER_ORDER_BIAS]))
         may = jnp.array([False, True, False]) | due & (orders >= self.min_order) & (orders <= self.max_order)
         factors = jnp.where(may, factors, 0.0)
-        best = jnp.argmax(factors.at[1].multiply(BETTER))
-        grow = (factors[best] >= WORTHWHILE) & ~retried
+        best = jnp.argmax(factors.at[1].multiply(ORDER_CHANGE_GAIN))
+        grow = (factors[best] >= LEAST_GROWTH) & ~retried
         order = jnp.where(grow | (factors[best] >= 1), orders[best], k)
         wait = jnp.where(order != k, order + 1, jnp.where(due, 2, jnp.maximum(wait, jnp.where(retried, 2, 0))))
-        return jnp.where(grow, jnp.minimum(factors[best], LARGEST), 1.0), order, wait
+        return jnp.where(grow, jnp.minimum(factors[best], LARGEST_FACTOR), 1.0), order, wait
 
 
 class _Size(eqx.Module):

@@ -23,9 +23,11 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int, PyTree
 
-HIGHEST = 12  # highest order; methods of higher orders are hardly stable
+HIGHEST_ORDER = 12  # highest order; methods of higher orders are hardly stable
 # Gauss points and weights on [0, 1]: they integrate every c_i exactly, and without cancellation, since no c_i is negative.
-POINTS, WEIGHTS = (0.5 * (x + shift) for x, shift in zip(np.polynomial.legendre.leggauss(HIGHEST // 2 + 1), (1.0, 0.0)))
+GAUSS_POINTS, GAUSS_WEIGHTS = (
+    0.5 * (x + shift) for x, shift in zip(np.polynomial.legendre.leggauss(HIGHEST_ORDER // 2 + 1), (1.0, 0.0))
+)
 
 
 def _adams_moulton(count: int) -> np.ndarray:
@@ -36,7 +38,7 @@ def _adams_moulton(count: int) -> np.ndarray:
     return np.abs(gamma)
 
 
-GAMMA = _adams_moulton(HIGHEST + 2)
+GAMMA = _adams_moulton(HIGHEST_ORDER + 2)
 
 
 class StepCoefficients(eqx.Module):
@@ -63,10 +65,10 @@ def step_coefficients(h: Float[Array, ""], ages: Float[Array, "N"]) -> StepCoeff
 
 def integrate_basis(s: Float[Array, ""], h: Float[Array, ""], ages: Float[Array, "N"]) -> Float[Array, "N"]:
     """Return the integrals of c_1, ..., c_N from 0 to s."""
-    at = s * POINTS[:, None]
+    at = s * GAUSS_POINTS[:, None]
     factors = (at * h + ages[:-1]) / (h + ages[:-1])
     c = jnp.concatenate([jnp.ones_like(factors[:, :1]), jnp.cumprod(factors, axis=1)], axis=1)
-    return s * (WEIGHTS @ c)
+    return s * (GAUSS_WEIGHTS @ c)
 
 
 class DifferenceInterpolation(diffrax.AbstractLocalInterpolation):

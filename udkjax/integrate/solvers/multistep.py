@@ -23,7 +23,7 @@ Flag = Bool[ArrayLike, ""]
 Unravel = Callable[[Float[Array, "n"]], PyTree[Array]]
 
 SAFETY = 0.9  # default of diffrax.PIDController
-STRICTER = 8.0  # ratio of the tolerance to the target error of a step, since the errors of many short steps add up
+STRICTNESS = 8.0  # ratio of the tolerance to the target error of a step, since the errors of many short steps add up
 LOST_STEP = 0.05  # a step cut to a smaller fraction restarts at order one: there was a jump
 ERROR_ORDER = 2  # for the controller: the order of the error of the first step, which has order one
 

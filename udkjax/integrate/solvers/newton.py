@@ -27,9 +27,9 @@ from udkjax.integrate.solvers.multistep import Unravel, vector_field
 
 ITERATIONS = 3  # MAXCOR: iterations with one matrix; more rarely help
 JACOBIAN_STEPS, MATRIX_STEPS = 50, 20  # MSBJ, MSBP: largest ages in steps
-CHANGE = 0.3  # CCMAX: largest relative change of c with the same M
-FASTEST = 0.3  # CRDOWN: largest decrease of the rate of convergence in an iteration, since one fast iteration proves little
-DIVERGING = 2.0  # RDIV: ratio of successive corrections at which to give up
+COEFFICIENT_CHANGE = 0.3  # CCMAX: largest relative change of c with the same M
+RATE_MEMORY = 0.3  # CRDOWN: largest decrease of the rate of convergence in an iteration, since one fast iteration proves little
+DIVERGING_RATIO = 2.0  # RDIV: ratio of successive corrections at which to give up
 
 
 class Implicit(eqx.Module):
@@ -104,7 +104,7 @@ def solve(
         iterations: the number of iterations with one matrix after which the iteration fails.
     """
     renew = state.jacobian_age >= JACOBIAN_STEPS
-    factor = renew | (state.matrix_age >= MATRIX_STEPS) | ~(jnp.abs(equation.c / state.c - 1) <= CHANGE)
+    factor = renew | (state.matrix_age >= MATRIX_STEPS) | ~(jnp.abs(equation.c / state.c - 1) <= COEFFICIENT_CHANGE)
     no = jnp.array(False)
     start = _Iteration(state, jnp.zeros_like(equation.y), jnp.ones_like(equation.c), jnp.array(0), no, renew, factor, no, no)
 
@@ -114,9 +114,9 @@ def solve(
         d = 2 / (1 + equation.c / state.c) * lu_solve((state.lu, state.pivots), residual)
         far = size(d)
         first = now.count == 0
-        rate = jnp.where(first, state.rate, jnp.maximum(FASTEST * state.rate, far / now.size))
+        rate = jnp.where(first, state.rate, jnp.maximum(RATE_MEMORY * state.rate, far / now.size))
         converged = far * jnp.minimum(1.0, rate) <= 1
-        hopeless = ~first & ~(far <= DIVERGING * now.size) | (now.count == iterations - 1) | ~jnp.isfinite(far)
+        hopeless = ~first & ~(far <= DIVERGING_RATIO * now.size) | (now.count == iterations - 1) | ~jnp.isfinite(far)
         stuck, fresh = ~converged & hopeless, now.fresh | now.renew
         refreshes = stuck & ~fresh
         state = eqx.tree_at(lambda k: k.rate, state, jnp.where(jnp.isfinite(rate) & ~stuck, rate, 1.0))

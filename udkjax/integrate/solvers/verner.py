@@ -28,7 +28,7 @@ TABLEAU = diffrax.ButcherTableau(
 
 # Column m: coefficients of s^(m + 1). Among the weights b(s) of the eight stages that meet the conditions of order 4 at every s,
 # these have the smallest residuals in the conditions of order 5, then of order 6. b(1) is b_sol; b'(0) selects the first stage.
-DENSE = np.array(
+DENSE_WEIGHTS = np.array(
     [
         [1.0, -2.7926169818074067, 2.6533780544166103, -0.6910024927492995, -0.09940999448060499, 0.0046514146207005174],
         [0.0, 0.0, 0.0, 0.0, 0.0, 0.0],
@@ -58,7 +58,7 @@ class VernerInterpolation(diffrax.AbstractLocalInterpolation):
         if t1 is not None:
             return jax.tree.map(jnp.subtract, self.evaluate(t1), self.evaluate(t0))
         s = (t0 - self.t0) / jnp.where(self.t1 == self.t0, 1.0, self.t1 - self.t0)
-        b = jnp.asarray(DENSE, s.dtype) @ s ** jnp.arange(1, DENSE.shape[1] + 1)
+        b = jnp.asarray(DENSE_WEIGHTS, s.dtype) @ s ** jnp.arange(1, DENSE_WEIGHTS.shape[1] + 1)
         return jax.tree.map(lambda y, k: y + jnp.tensordot(b, k, axes=1), self.y0, self.k)
 
 

@@ -6,9 +6,9 @@ from collections.abc import Mapping
 
 from udkjax.native.c.instructions import Instructions
 from udkjax.native.c.names import Names
-from udkjax.native.c.syntax import TYPES, CExpression, FunctionText, function_head, literal, number_at, pointer_type
+from udkjax.native.c.syntax import C_TYPES, CExpression, FunctionText, function_head, literal, number_at, pointer_type
 
-LONGEST = 90  # characters of an expression: a longer one gets a name
+MOST_CHARACTERS = 90  # characters of an expression: a longer one gets a name
 
 
 class FunctionBody(Instructions):
@@ -78,7 +78,7 @@ class FunctionBody(Instructions):
             self._name(name, self._pending.pop(name))
 
     def _name(self, name: str, e: CExpression):
-        kind = pointer_type(e.element) if e.kind == "ptr" else f"{TYPES[e.kind]} "
+        kind = pointer_type(e.element) if e.kind == "ptr" else f"{C_TYPES[e.kind]} "
         self._known[name] = CExpression(name, e.kind, set(), e.element)
         self._scopes[name] = tuple(self._blocks)
         if name in self._hoisted:
@@ -101,7 +101,7 @@ class FunctionBody(Instructions):
         e = self._known[name]
         scope = self._scopes.get(name, (0,))
         if tuple(self._blocks[: len(scope)]) != scope:
-            self._hoisted[name] = f"{pointer_type(e.element) if e.kind == 'ptr' else f'{TYPES[e.kind]} '}{name}"
+            self._hoisted[name] = f"{pointer_type(e.element) if e.kind == 'ptr' else f'{C_TYPES[e.kind]} '}{name}"
         return e
 
     def _line(self, line: str, following: str):
@@ -170,10 +170,16 @@ class FunctionBody(Instructions):
             self._reserve(name, text)
             return
         e = getattr(self, f"_{operation}", self._binary)(text)
-        if e.kind == "ptr" and e.text.startswith("&") and self._uses[name] > 1 and len(e.text) < LONGEST // 2 and not e.reads:
+        if (
+            e.kind == "ptr"
+            and e.text.startswith("&")
+            and self._uses[name] > 1
+            and len(e.text) < MOST_CHARACTERS // 2
+            and not e.reads
+        ):
             self._known[name] = e  # an address by names that stay
             self._scopes[name] = (0,)
-        elif self._uses[name] == 1 and len(e.text) < LONGEST:
+        elif self._uses[name] == 1 and len(e.text) < MOST_CHARACTERS:
             self._pending[name] = e
         else:
             self._name(name, e)
@@ -181,7 +187,7 @@ class FunctionBody(Instructions):
     def _reserve(self, name: str, text: str):
         match = re.match(r"alloca (\w+), i64 (\d+)", text)
         assert match, text
-        kind = "double *" if match[1] == "ptr" else f"{TYPES[match[1]]} "
+        kind = "double *" if match[1] == "ptr" else f"{C_TYPES[match[1]]} "
         direct = self._uses[name] == self._direct[name]
         if int(match[2]) == 1 and direct:
             self._slots[name] = name

@@ -4,7 +4,7 @@ import re
 from collections.abc import Mapping
 
 from udkjax.native.c.names import Names
-from udkjax.native.c.syntax import TYPES, CExpression, FunctionText, array_and_index, number_at, operand, pointer_type
+from udkjax.native.c.syntax import C_TYPES, CExpression, FunctionText, array_and_index, number_at, operand, pointer_type
 
 SIGNS = {"add": "+", "sub": "-", "mul": "*", "div": "/", "and": "&", "or": "|", "xor": "^", "shl": "<<", "lshr": ">>"}
 COMPARISONS = {"lt": "<", "le": "<=", "gt": ">", "ge": ">=", "eq": "==", "ne": "!="}
@@ -45,7 +45,7 @@ class Instructions:
         assert match, text
         base, index, element = self._value(match[2], "ptr"), self._value(match[3], "i64"), match[1]
         if base.element not in (element, "table"):
-            base = CExpression(f"(({TYPES[element]} *){operand(base.text)})", "ptr", base.reads, element)
+            base = CExpression(f"(({C_TYPES[element]} *){operand(base.text)})", "ptr", base.reads, element)
         if base.element == "table":
             element = "table" if element != "i8" else "double"
         if index.text == "0":
@@ -108,9 +108,9 @@ class Instructions:
             return CExpression(f"{'bits_of' if match[4] == 'i64' else 'from_bits'}({a.text})", match[4], a.reads)
         if match[1] in ("ptrtoint", "inttoptr"):
             through = "(intptr_t)"
-            kind = "double *" if match[4] == "ptr" else TYPES[match[4]]
+            kind = "double *" if match[4] == "ptr" else C_TYPES[match[4]]
             return CExpression(f"({kind}){through}{operand(a.text)}", match[4], a.reads)
-        return CExpression(f"({TYPES[match[4]]}){operand(a.text)}", match[4], a.reads)
+        return CExpression(f"({C_TYPES[match[4]]}){operand(a.text)}", match[4], a.reads)
 
     _bitcast = _sitofp = _uitofp = _fptosi = _zext = _sext = _ptrtoint = _inttoptr = _cast
 

@@ -4,7 +4,7 @@ import re
 import struct
 from dataclasses import dataclass, field
 
-TYPES = {"double": "double", "i64": "int64_t", "i1": "int", "i32": "int32_t", "i8": "char"}
+C_TYPES = {"double": "double", "i64": "int64_t", "i1": "int", "i32": "int32_t", "i8": "char"}
 
 
 @dataclass
@@ -41,13 +41,13 @@ class CExpression:
 
 def pointer_type(element: str) -> str:
     """Return the type in C of addresses of numbers of the type `element`; tables (i32) and the call record (i64) are const."""
-    return f"{'const ' if element in ('i32', 'i64') else ''}{TYPES[element]} *"
+    return f"{'const ' if element in ('i32', 'i64') else ''}{C_TYPES[element]} *"
 
 
 def function_head(f: FunctionText) -> str:
     """Return the head of a function's definition in C: the type of its result, its name and its arguments."""
-    arguments = [f"{pointer_type(f.elements[n])}{n}" if kind == "ptr" else f"{TYPES[kind]} {n}" for kind, n in f.arguments]
-    return f"{'void' if f.returns == 'void' else TYPES[f.returns]} {f.name}({', '.join(arguments)})"
+    arguments = [f"{pointer_type(f.elements[n])}{n}" if kind == "ptr" else f"{C_TYPES[kind]} {n}" for kind, n in f.arguments]
+    return f"{'void' if f.returns == 'void' else C_TYPES[f.returns]} {f.name}({', '.join(arguments)})"
 
 
 def literal(text: str, kind: str) -> str:

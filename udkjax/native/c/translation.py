@@ -11,10 +11,10 @@ from collections.abc import Iterable, Mapping
 
 from udkjax.native.c.body import FunctionBody
 from udkjax.native.c.names import Names
-from udkjax.native.c.syntax import TYPES, FunctionText, function_head, literal
+from udkjax.native.c.syntax import C_TYPES, FunctionText, function_head, literal
 
-VECTOR = re.compile(r"<2 x (\w+)>")  # of two numbers, the second of which no one uses (language/elementary/parts.py)
-HEAD = """#include <math.h>
+VECTOR_TYPE = re.compile(r"<2 x (\w+)>")  # of two numbers, the second of which no one uses (language/elementary/parts.py)
+PREAMBLE = """#include <math.h>
 #include <stdint.h>
 #include <string.h>
 
@@ -39,7 +39,7 @@ HELPERS = {
     "load_address": "double *load_address(const void *p) { return (double *)(intptr_t)load_integer(p); }",
     "store_address": "void store_address(void *p, const void *x) { store_integer(p, (int64_t)(intptr_t)x); }",
 }
-NEEDED = {"load_address": "load_integer", "store_address": "store_integer"}
+NEEDED_HELPERS = {"load_address": "load_integer", "store_address": "store_integer"}
 
 
 def translated(text: str, entry: str, names: Names, meanings: Mapping[str, str] | None = None) -> str:
@@ -60,7 +60,7 @@ def translated(text: str, entry: str, names: Names, meanings: Mapping[str, str] 
     everything = "\n".join(bodies.values())
     tables = [(name, definition) for name, definition in tables if re.search(rf"\b{name}\b", everything)]
     prototypes = [f"static {function_head(known[name])};" for name in order]
-    parts = [HEAD, helpers(everything), names.text(meanings or {}, everything), "\n".join(x for _, x in tables)]
+    parts = [PREAMBLE, helpers(everything), names.text(meanings or {}, everything), "\n".join(x for _, x in tables)]
     own = [f"static {body}" for body in bodies.values()]
     return "\n".join([*parts, "\n".join(prototypes), "", "\n".join(own)])
 
@@ -68,13 +68,13 @@ def translated(text: str, entry: str, names: Names, meanings: Mapping[str, str] 
 def helpers(text: str) -> str:
     """Return the definitions of the `HELPERS` that a text in C calls, and of those that they need."""
     used = {name for name in HELPERS if re.search(rf"\b{name}\(", text)}
-    used |= {NEEDED[name] for name in used if name in NEEDED}
+    used |= {NEEDED_HELPERS[name] for name in used if name in NEEDED_HELPERS}
     return "\n".join(f"static {definition}" for name, definition in HELPERS.items() if name in used)
 
 
 def _functions(text: str) -> Iterable[FunctionText]:
     for match in re.finditer(
-        r"^define (\w+) @(\w+)\(([^)]*)\)[^{]*\{\n(.*?)\n\}", VECTOR.sub(r"\1", text), re.MULTILINE | re.DOTALL
+        r"^define (\w+) @(\w+)\(([^)]*)\)[^{]*\{\n(.*?)\n\}", VECTOR_TYPE.sub(r"\1", text), re.MULTILINE | re.DOTALL
     ):
         arguments = [(x.split()[0], x.split("%")[1]) for x in match[3].split(", ") if x]
         yield FunctionText(match[2], match[1], arguments, [line.strip() for line in match[4].split("\n")])
@@ -111,6 +111,6 @@ def _table(line: str) -> tuple[str, str]:
     else:
         match = re.search(r"\[\d+ x (\w+)\] \[(.*)\]", line)
         assert match, line
-        numbers, kind = [literal(x.split()[1], match[1]) for x in match[2].split(", ")], TYPES[match[1]]
+        numbers, kind = [literal(x.split()[1], match[1]) for x in match[2].split(", ")], C_TYPES[match[1]]
     rows = [", ".join(numbers[k : k + 12]) for k in range(0, len(numbers), 12)]
     return name[1], f"static const {kind} {name[1]}[] = {{{(',' + chr(10) + '    ').join(rows)}}};"

@@ -13,7 +13,7 @@ from udkjax.native.module.layout import LANE_NUMBERS
 from udkjax.native.module.memory import Memory
 from udkjax.native.operations import Operation
 
-ENTRY = "run_member"  # of the text; its arguments are the call record, the memory, and the index of the member
+ENTRY_FUNCTION = "run_member"  # of the text; its arguments are the call record, the memory, and the index of the member
 FLOPS = {
     "fadd": 1,
     "fsub": 1,
@@ -78,7 +78,7 @@ def c_unit(operation: Operation, directions: int = 0) -> CUnit:
     text = text_of_module([*code.functions, *code.shared], code.globals)
     places = dict(module.places.places)
     meanings = {name: words for name, words in LANE_NUMBERS.items() if name in places}
-    c = translated(text, ENTRY, Names(places, module.call_fields), meanings)
+    c = translated(text, ENTRY_FUNCTION, Names(places, module.call_fields), meanings)
     return CUnit(c, module, code.size, count_operations(text))
 
 

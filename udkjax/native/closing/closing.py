@@ -21,7 +21,7 @@ from udkjax.native.pseudoinverses.svd import SVDCode
 from udkjax.native.pseudoinverses.weighted_rows import WeightedRows
 from udkjax.native.run.members import write_begin
 
-CORRECTED = "qv"  # corrected quantities, by their index in a record
+CORRECTED_QUANTITIES = "qv"  # corrected quantities, by their index in a record
 
 
 class Closing(Module):
@@ -36,7 +36,7 @@ class Closing(Module):
         super().__init__(plan, active=active)
         self.active, self.count = active, len(self.moving)
         self._rows = WeightedRows(self, SVDCode(relative=True)) if code.is_small else None
-        self.corrections = {x: self._correction(f"newton_{x}") for x in CORRECTED}
+        self.corrections = {x: self._correction(f"newton_{x}") for x in CORRECTED_QUANTITIES}
         self.places.add("correction", max(x.stored for x in self.corrections.values()))
 
     def _correction(self, name: str) -> LeastNormCorrection | EliminationCorrection:

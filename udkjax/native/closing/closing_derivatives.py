@@ -12,11 +12,11 @@ from contextlib import contextmanager
 from udkjax.equations.programs.run_programs import RunPrograms
 from udkjax.equations.rows.position_closure import CLOSURE
 from udkjax.expressions.loops.loop_derivative import FORWARD, REVERSE, TWICE
-from udkjax.native.closing.closing import CORRECTED, Closing
+from udkjax.native.closing.closing import CORRECTED_QUANTITIES, Closing
 from udkjax.native.language.ir import DOUBLE, INT, POINTER, Function, Value
 from udkjax.native.module.layout import Layout
-from udkjax.native.module.program_derivative import GIVEN, WAYS, ProgramDerivative
-from udkjax.native.module.prologue import PROLOGUE, write_prologue_derivative
+from udkjax.native.module.program_derivative import GIVEN_DIRECTIONS, WAYS, ProgramDerivative
+from udkjax.native.module.prologue import PROLOGUE_NAMES, write_prologue_derivative
 
 
 class ClosingDerivative(Closing):
@@ -45,7 +45,7 @@ class ClosingForward(ClosingDerivative):
 
     def __init__(self, code: RunPrograms, vector: int, active: Sequence[bool]):
         super().__init__(code, vector, active)
-        self.inputs = tuple(f"{way}{x}" for way in self.ways if way in GIVEN for x in ("numbers", "q", "v"))
+        self.inputs = tuple(f"{way}{x}" for way in self.ways if way in GIVEN_DIRECTIONS for x in ("numbers", "q", "v"))
         self.tangents = w = Layout(1, self.plan.vector)
         w.add("numbers", code.number_count)
         w.add("constants", self.constants)
@@ -120,11 +120,11 @@ class ClosingForward(ClosingDerivative):
                     ("q", "state q", self.n),
                     ("v", "state v", self.n),
                 ):
-                    start = self.member_address(f, f"{way}{name}", member) if way in GIVEN else None
+                    start = self.member_address(f, f"{way}{name}", member) if way in GIVEN_DIRECTIONS else None
                     with f.each(count) as i:
                         self.put_entry(f, to, i, f.load(start, p * count + i) if start else f.const(0.0), way)
             changes = [f.at(f.given[way], self.tangents[x]) for x in ("numbers", "constants") for way in self.ways]
-            f.call(PROLOGUE[self.mode], self.member_address(f, "numbers", member), constants, *changes)
+            f.call(PROLOGUE_NAMES[self.mode], self.member_address(f, "numbers", member), constants, *changes)
 
     def _finish_closing(self, f: Function, member: Value):
         directions = self.field(f, "directions")
@@ -233,7 +233,7 @@ class ClosingReverse(ClosingDerivative):
     def _record_correction(self, f: Function, x: str, scale: Value, limited: Value):
         number = self.to_int(f, self.entry(f, "records", 0))
         row = f.at(f.given["work"], number * self.row + self.places["record"])
-        for k, value in enumerate((f.const(float(CORRECTED.index(x))), scale, limited)):
+        for k, value in enumerate((f.const(float(CORRECTED_QUANTITIES.index(x))), scale, limited)):
             f.store(value, row, k)
         self.copy_lane(f, row, 3, "state q", f.const(0, INT))
         self.copy_lane(f, row, 3 + self.n, "state v", f.const(0, INT))
@@ -265,7 +265,7 @@ class ClosingReverse(ClosingDerivative):
 
             f.choose(f.load(row, 0) > 0.5, pull("pull_v"), pull("pull_q"))
         constants, bars, to = (self.address(f, x) for x in ("constants", "total bar constants", "numbersbar"))
-        f.call(PROLOGUE[REVERSE], self.member_address(f, "numbers", member), constants, bars, to)
+        f.call(PROLOGUE_NAMES[REVERSE], self.member_address(f, "numbers", member), constants, bars, to)
         for name, place, count in (
             ("numbersbar", "numbersbar", self.code.number_count),
             ("qbar", "bar iterate q", self.n),

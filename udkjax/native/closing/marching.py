@@ -31,13 +31,13 @@ CORRECTIONS = 2
 # Arc of a step, over the square of the distance from dependent rows, up to which all rows stay independent. Over an arc, a row
 # turns by about as much, and the span of the others by up to the arc over their distance.
 KEEPS_SIDE = 0.25
-STRAIGHT = 0.95  # cosine of the largest rotation of the tangent in a step
-SLACK = 0.1  # largest distance of a position from its prediction, as a fraction of the step
+STRAIGHT_COSINE = 0.95  # cosine of the largest rotation of the tangent in a step
+PREDICTION_SLACK = 0.1  # largest distance of a position from its prediction, as a fraction of the step
 _METHOD = LUCode(relative=True)
 # Steps along the arc, in characteristic lengths or radians: the longest one, and one that is not halved any more.
-LONGEST, SHORTEST = 1.0, 1e-3
+LONGEST_STEP, SHORTEST_STEP = 1.0, 1e-3
 MAX_STEPS = 2000  # in addition to four for each value: enough for some hundred turns
-LENGTHENING = 1.5  # below 2, so that a step which had to be halved is not tried again at once
+STEP_GROWTH = 1.5  # below 2, so that a step which had to be halved is not tried again at once
 
 
 class _Going:
@@ -149,9 +149,9 @@ class Marching(Module):
             going.side.where(may_turn, side)
         going.value.where(accepted, now)
         going.count.where(tries, going.count.value + 1.0)
-        ends = refused & ~(f.abs(h) * old_rate > SHORTEST) | (going.count.value > self.field(f, "times") * 4 + MAX_STEPS)
+        ends = refused & ~(f.abs(h) * old_rate > SHORTEST_STEP) | (going.count.value > self.field(f, "times") * 4 + MAX_STEPS)
         going.good.where(tries & ends, 0.0)
-        longer = f.min(f.max(going.longest.value, f.abs(h) * LENGTHENING), f.const(LONGEST) / new_rate)
+        longer = f.min(f.max(going.longest.value, f.abs(h) * STEP_GROWTH), f.const(LONGEST_STEP) / new_rate)
         going.longest.value = f.select(accepted, longer, f.select(refused, f.abs(h) * 0.5, going.longest.value))
         going.begins.value = 0.0
 
@@ -205,8 +205,8 @@ class Marching(Module):
             new_square.value = f.fma(new, new, new_square.value)
         violated, per_unit = largest_violation(self, f), one / (s.omega * s.omega)
         old_rate, new_rate = (f.intrinsic("sqrt", x.value + per_unit) for x in (old_square, new_square))
-        is_straight = product.value + per_unit > old_rate * new_rate * STRAIGHT
-        is_near = deviation.value < f.abs(h) * old_rate * SLACK + largest.value * (64 * eps)
+        is_straight = product.value + per_unit > old_rate * new_rate * STRAIGHT_COSINE
+        is_near = deviation.value < f.abs(h) * old_rate * PREDICTION_SLACK + largest.value * (64 * eps)
         is_closed = ~(violated > largest.value * (CLOSURE.rounding * eps)) & f.is_finite(violated)
         is_smooth = (is_straight & is_near) | begins
         return is_closed & self._has_digits(f, s, new_rate) & is_smooth, old_rate, new_rate

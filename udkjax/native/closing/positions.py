@@ -17,19 +17,19 @@ from udkjax.equations.rows.position_closure import CLOSURE
 from udkjax.native.code import machine, processor
 from udkjax.native.language.ir import DOUBLE, INT, POINTER, Function, Value, Variable
 from udkjax.native.language.program import consecutive, write
-from udkjax.native.language.text import ALLOCATION, text_of_module
+from udkjax.native.language.text import ALLOCATION_DECLARATIONS, text_of_module
 from udkjax.threads import thread_count
 
 # A Newton step shorter than this, in units of the coordinates, is the last: the next would be of the order of its square.
 LAST_STEP = 1e-7
 LONGEST_CORRECTION = 0.5  # largest Newton step, in units of the coordinates; longer steps lead to another position
 LONGEST_OF_MARCH = 0.1  # largest Newton step in a march; otherwise the step of the march is shortened
-SHORTEST = 2.0**-15  # shortest step of a march, relative to the longest; a member that fails even so has reached its end
+SHORTEST_STEP = 2.0**-15  # shortest step of a march, relative to the longest; a member that fails even so has reached its end
 MOST_CORRECTIONS = 12
-FARTHEST = 4.0  # largest extrapolation by the cubic through two positions, relative to the previous step
+LARGEST_EXTRAPOLATION = 4.0  # largest extrapolation by the cubic through two positions, relative to the previous step
 MOST_SUBSTEPS = 1000  # maximum number between two positions; more indicate a wrong unit of the values
-POINTERS = ("x", "s", "guess", "data", "unit", "q", "out", "end", "next")
-FIELDS = ("members", "count", "marches", "s stride", "data stride", *POINTERS, "longest")
+POINTER_FIELDS = ("x", "s", "guess", "data", "unit", "q", "out", "end", "next")
+CALL_FIELDS = ("members", "count", "marches", "s stride", "data stride", *POINTER_FIELDS, "longest")
 
 
 class Positions(NamedTuple):
@@ -91,7 +91,7 @@ class PositionCode:
         fields = {name: a.ctypes.data for name, a in arrays.items()}
         fields |= {"members": members, "count": count, "marches": guess is None, "longest": np.float64(longest).view(np.int64)}
         fields |= {"s stride": count if s.ndim > 1 else 0, "data stride": count * sizes.data if data.ndim > 2 else 0}
-        call = (ctypes.c_int64 * len(FIELDS))(*(int(fields[name]) for name in FIELDS))
+        call = (ctypes.c_int64 * len(CALL_FIELDS))(*(int(fields[name]) for name in CALL_FIELDS))
         threads = min(threads or thread_count(), -(-members // self.width)) if members else 0
         if threads == 1:
             self._run(ctypes.addressof(call))
@@ -135,7 +135,7 @@ class _Text:
         ]  # fmt: skip
         for f in functions[:3]:
             f.noinline = True
-        return text_of_module(functions, declared=ALLOCATION)
+        return text_of_module(functions, declared=ALLOCATION_DECLARATIONS)
 
     # --- memory
 
@@ -146,7 +146,7 @@ class _Text:
         f.store(x, f.given["work"], (f.like(i, INT, 1) + self.places[name]) * self.width, self.width)
 
     def _field(self, f: Function, name: str, base: str = INT) -> Value:
-        return f.load(f.given["call"], FIELDS.index(name), base=base)
+        return f.load(f.given["call"], CALL_FIELDS.index(name), base=base)
 
     def _gather(self, f: Function, addresses: Sequence[Value], name: str, count: int):
         """Load `count` numbers for each lane, from the address of that lane, into the array `name`."""
@@ -298,7 +298,7 @@ class _Text:
             lost = (self._load(f, "sign") * sign.value <= 0.0) | end.is_not(end)
             self._put(f, "end", f.select(lost, np.nan, end))
             size = farthest / steps
-            repeats = f.any_of(lost & (alive >= 0.0)) & (size > limit * SHORTEST) & (rounds.value < MOST_SUBSTEPS)
+            repeats = f.any_of(lost & (alive >= 0.0)) & (size > limit * SHORTEST_STEP) & (rounds.value < MOST_SUBSTEPS)
             f.choose(
                 repeats,
                 lambda alive=alive, step=step, size=size: restore(alive, step, size),
@@ -313,7 +313,7 @@ class _Text:
 
         `before`: the previous step of s; zero if there is none.
         """
-        has_previous = (f.abs(before) > 0.0) & (f.abs(before) * FARTHEST >= f.abs(step))
+        has_previous = (f.abs(before) > 0.0) & (f.abs(before) * LARGEST_EXTRAPOLATION >= f.abs(step))
         u = f.select(has_previous, step / f.select(has_previous, before, 1.0), 0.0) + 1.0
         u2, u3 = u * u, u * u * u
         old, old_rate = u3 * 2.0 - u2 * 3.0 + 1.0, (u3 - u2 * 2.0 + u) * before

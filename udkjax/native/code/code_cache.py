@@ -22,7 +22,7 @@ MAX_BYTES = 2**28  # maximum total size of the files; each has 10 to 75 KiB
 WRITES_OF_CHECK = 500  # number of writes between two checks of the limit, as listing thousands of files takes 20 ms
 TOUCH_AFTER = 86_400.0  # accuracy (s) of a file's time of last use: most reads need not update it
 _MAGIC = b"udkjax object 2\n"
-_READING = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)  # opening a pipe does not wait for a writer
+_READ_FLAGS = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)  # opening a pipe does not wait for a writer
 
 
 def cache_folder() -> Path | None:
@@ -75,7 +75,7 @@ def _head(name: str, code: bytes) -> bytes:
 
 def _read_own(path: Path) -> bytes:
     """Return the content of a file; b"" unless it is a regular file of this user (or root) that others may not write."""
-    handle = os.open(path, _READING)
+    handle = os.open(path, _READ_FLAGS)
     try:
         status = os.fstat(handle)
         if not stat.S_ISREG(status.st_mode) or distrust(status):

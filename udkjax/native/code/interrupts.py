@@ -6,7 +6,7 @@ start before each step, and ends its members as `INTERRUPTED` once it differs. R
 
 The handler replaces Python's only while that raises `KeyboardInterrupt`: a program with a handler of its own, which may want
 runs to end as usual, keeps it. Programs may set handlers at any time. Loading code installs the handler, each call from Python
-does again, and so does `run` after ARMED steps, for compiled programs of JAX, which call machine code without Python.
+does again, and so does `run` after ARMING_STEPS steps, for compiled programs of JAX, which call machine code without Python.
 """
 
 import ctypes
@@ -18,10 +18,10 @@ from udkjax.native.code import machine
 from udkjax.native.language.ir import INT, POINTER, Function, Value
 
 POINTER_NAME = "interrupts"  # pointer of a module, set by the host, to a record: the count, and the address of `install`
-GLOBAL = f"@{POINTER_NAME} = global ptr null"
-ARMED = 2**14  # steps of a call, some 30 ms, after which it installs the handler
+POINTER_GLOBAL = f"@{POINTER_NAME} = global ptr null"
+ARMING_STEPS = 2**14  # steps of a call, some 30 ms, after which it installs the handler
 
-_HANDLER = """
+_HANDLER_TEXT = """
 @record = global { i64, ptr } zeroinitializer
 @previous = global ptr null
 
@@ -38,7 +38,7 @@ class _Handler:
     """The handler of SIGINT as machine code, which stays loaded as long as the process runs."""
 
     def __init__(self):
-        self._library = machine.library(_HANDLER, ("record", "previous", "on_interrupt"))
+        self._library = machine.library(_HANDLER_TEXT, ("record", "previous", "on_interrupt"))
         self.record, self._address = self._library["record"], self._library["on_interrupt"]
         self._get, self._set = (getattr(ctypes.pythonapi, f"PyOS_{x}sig") for x in ("get", "set"))
         self._get.argtypes, self._set.argtypes = (ctypes.c_int,), (ctypes.c_int, ctypes.c_void_p)
@@ -87,11 +87,11 @@ class Interruption:
     def has_come(self) -> Value:
         """Return whether a signal has come since the start of the run.
 
-        The code runs once for each step, counts steps, and installs the handler again after `ARMED` steps.
+        The code runs once for each step, counts steps, and installs the handler again after `ARMING_STEPS` steps.
         """
         f, steps = self._f, self._steps.value + 1
         self._steps.value = steps
-        with f.if_(steps.is_(ARMED)):
+        with f.if_(steps.is_(ARMING_STEPS)):
             install = f.op(f"load ptr, ptr {f.at(self._record, 1, INT).name}, align 8", POINTER)
             f.line(f"call void {install.name}()")
         return self._count().is_not(self._start)

@@ -19,8 +19,9 @@ from udkjax.native.code.processor import llvm, target
 from udkjax.native.language.text import named_apart
 from udkjax.threads import thread_count
 
-LEVEL = 1  # level of code generation; level 2 takes a fifth longer to compile, with equal run time
-QUICK = 0  # level for first calls: a quarter of the compile time; runs take twice as long, five times in lanes; equal rounding
+OPTIMIZATION_LEVEL = 1  # level of code generation; level 2 takes a fifth longer to compile, with equal run time
+# Level for first calls: a quarter of the compile time; runs take twice as long, five times in lanes; equal rounding.
+QUICK_LEVEL = 0
 # Optimization passes before code generation. Programs have no common subexpressions and no dead code: LLVM's own selection for
 # level 1 would shorten runs by 2 % and double the compile time.
 PASSES = ("sroa", "simplify_cfg")
@@ -38,7 +39,7 @@ def _target_machine(level: int) -> Any:
     return machine.create_target_machine(cpu=cpu, features=features, opt=level, reloc="pic", codemodel="small", jit=True)
 
 
-def digest(text: str, level: int = LEVEL) -> str:
+def digest(text: str, level: int = OPTIMIZATION_LEVEL) -> str:
     """Return the name under which the code of a text is stored, for this processor and compiler and a level of optimization."""
     return hashlib.sha256("\0".join((text, _compiler(), str(level), *PASSES)).encode()).hexdigest()[:32]
 
@@ -54,7 +55,11 @@ def _compiler() -> str:
 @cache
 def _linker() -> Any:
     """Return the loader of object code; JITLink places code and constants within reach of relative addresses."""
-    machine = llvm().Target.from_default_triple().create_target_machine(opt=LEVEL, reloc="pic", codemodel="small", jit=True)
+    machine = (
+        llvm()
+        .Target.from_default_triple()
+        .create_target_machine(opt=OPTIMIZATION_LEVEL, reloc="pic", codemodel="small", jit=True)
+    )
     return llvm().create_lljit_compiler(machine, use_jit_link=sys.platform != "win32")
 
 
@@ -74,7 +79,7 @@ class Library:
     Args:
         parts: The object code of the parts of the module.
         names: The names whose addresses are needed.
-        is_optimized: Whether all parts are compiled with the level `LEVEL`.
+        is_optimized: Whether all parts are compiled with the level `OPTIMIZATION_LEVEL`.
     """
 
     _numbers = itertools.count()
@@ -94,7 +99,7 @@ class Library:
         return self._tracker[name]
 
 
-def library(text: str, names: Sequence[str], level: int = LEVEL) -> Library:
+def library(text: str, names: Sequence[str], level: int = OPTIMIZATION_LEVEL) -> Library:
     """Load the code of a module, which is on disk or compiled here.
 
     Args:
@@ -107,12 +112,12 @@ def library(text: str, names: Sequence[str], level: int = LEVEL) -> Library:
     """
     with ThreadPoolExecutor(thread_count()) as pool:
         codes, levels = zip(*pool.map(lambda part: _stored_code(part, level), split_module(text)), strict=True)
-    return Library(codes, names, is_optimized=min(levels) == LEVEL)
+    return Library(codes, names, is_optimized=min(levels) == OPTIMIZATION_LEVEL)
 
 
 def _stored_code(text: str, level: int) -> tuple[bytes, int]:
     """Return the object code of a text, and its level: a higher one than `level` if that code is on disk."""
-    for stored_level in range(LEVEL, level - 1, -1):
+    for stored_level in range(OPTIMIZATION_LEVEL, level - 1, -1):
         code = code_cache.read(digest(text, stored_level))
         if code is not None:
             return code, stored_level
@@ -151,9 +156,9 @@ def split_module(text: str) -> list[str]:
     return parts
 
 
-def compile_module(text: str, level: int = LEVEL) -> bytes:
+def compile_module(text: str, level: int = OPTIMIZATION_LEVEL) -> bytes:
     """Return the object code of a module for this processor, compiled at a level of code generation."""
-    return object_code(text, _target_machine(level), llvm().get_default_triple(), () if level == QUICK else PASSES)
+    return object_code(text, _target_machine(level), llvm().get_default_triple(), () if level == QUICK_LEVEL else PASSES)
 
 
 @cache

@@ -12,7 +12,7 @@ from typing import Any
 
 from udkjax.requirements import ArgumentError
 
-SETTING = "UDKJAX_LANES"
+LANES_VARIABLE = "UDKJAX_LANES"
 ARM_BASE = "generic"  # two lanes and fused multiply-add
 
 
@@ -55,11 +55,11 @@ def lanes() -> int:
             return 8
         return 4 if _has(features, ("avx2", "fma")) else 2
     if text not in map(str, LEVELS):
-        raise ArgumentError(f"{SETTING} must be 1, 2, 4 or 8 lanes of machine code, not {text!r}")
+        raise ArgumentError(f"{LANES_VARIABLE} must be 1, 2, 4 or 8 lanes of machine code, not {text!r}")
     chosen = int(text)
     if not _suits(chosen):
         most, words = max(filter(_suits, LEVELS)), LEVELS[chosen].words
-        raise ArgumentError(f"{SETTING}={chosen} needs {words}, which this processor lacks: it has at most {most} lanes")
+        raise ArgumentError(f"{LANES_VARIABLE}={chosen} needs {words}, which this processor lacks: it has at most {most} lanes")
     return chosen
 
 
@@ -76,7 +76,7 @@ def target() -> tuple[str, str]:
 
 
 def _setting() -> str:
-    return os.environ.get(SETTING, "").strip()
+    return os.environ.get(LANES_VARIABLE, "").strip()
 
 
 def _suits(count: int) -> bool:

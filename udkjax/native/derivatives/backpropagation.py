@@ -20,10 +20,10 @@ from udkjax.expressions.loops.loop_derivative import REVERSE
 from udkjax.native.derivatives.record import Recorded
 from udkjax.native.language.ir import DOUBLE, INT, POINTER, Function, Operand, Value
 from udkjax.native.module.layout import Lane, Plan
-from udkjax.native.module.prologue import PROLOGUE, write_prologue_derivative
+from udkjax.native.module.prologue import PROLOGUE_NAMES, write_prologue_derivative
 from udkjax.native.module.running import Repeat
 from udkjax.native.module.samples import ARGUMENTS, count_breakpoints, numbers_of_row
-from udkjax.native.module.steps import POINTS
+from udkjax.native.module.steps import NODE_COUNT
 from udkjax.native.module.tableau import Method
 from udkjax.native.run.dense_output import write_differences_back
 from udkjax.native.run.runge_kutta import stage_state
@@ -47,12 +47,12 @@ class Reverse(Recorded):
         p.add("bar constants", self.count)
         for name in ("bar state q", "bar state v", "bar result q", "bar result v"):
             p.add(name, n)
-        for k in range(POINTS):
+        for k in range(NODE_COUNT):
             for x in "qva":
                 p.add(f"bar point{k} {x}", n)
         for j in range(self.stages):
             p.add(f"bar stage{j} a", n)
-        for k in range(3 * POINTS):
+        for k in range(3 * NODE_COUNT):
             p.add(f"bar difference{k}", n)
 
     def write_derivatives(self):
@@ -247,7 +247,9 @@ class Reverse(Recorded):
         """Clear all cotangents, and load the last points of the members that are `ready`, with the cotangents of their ends."""
         n, times = self.n, self.field(f, "times")
         s.at = f.select(s.ready > 0.5, s.points - 1.0, 0.0)
-        zeros = [f"bar point{k} {x}" for k in range(POINTS) for x in "qva"] + [f"bar difference{k}" for k in range(3 * POINTS)]
+        zeros = [f"bar point{k} {x}" for k in range(NODE_COUNT) for x in "qva"] + [
+            f"bar difference{k}" for k in range(3 * NODE_COUNT)
+        ]
         for names, length in ((zeros, n), (["total bar constants"], self.count)):
             with f.each(length) as i:
                 for name in names:
@@ -256,8 +258,8 @@ class Reverse(Recorded):
             self._add_state(f, k, self.member_address(f, "endbar", self.lane_entry(f, "member", k)), "bar point3")
             with f.if_(self.to_int(f, self.lane_entry(f, "kept", k)) >= times):
                 self._add_output(f, k, times - 1, "bar point3")
-            for j in range(POINTS):
-                self._load_point(f, k, self.lane_entry(f, "at", k) - float(POINTS - 1 - j), f"point{j}")
+            for j in range(NODE_COUNT):
+                self._load_point(f, k, self.lane_entry(f, "at", k) - float(NODE_COUNT - 1 - j), f"point{j}")
             self._load_head(f, k)
         cleared = [("numbersbar", f.const(self.code.number_count, INT))]
         if self.plan.sampled:
@@ -291,11 +293,11 @@ class Reverse(Recorded):
         setattr(s, "state t", s.next)
         self._evaluate_projection(f)
         self._pull_projection(f, mask)
-        ahead = [self.broadcast(f, s.next - getattr(s, f"point{POINTS - 1 - k}_t")) for k in range(POINTS)]
+        ahead = [self.broadcast(f, s.next - getattr(s, f"point{NODE_COUNT - 1 - k}_t")) for k in range(NODE_COUNT)]
         with f.each(self.rowcount) as r:
             of_q, of_v = (self.vector(f, f"bar state {x}", r) for x in "qv")
             product, slope = f.const(1.0, DOUBLE, self.plan.vector), f.const(0.0, DOUBLE, self.plan.vector)
-            for k in range(3 * POINTS):
+            for k in range(3 * NODE_COUNT):
                 old = self.vector(f, f"bar difference{k}", r)
                 new = f.fma(product, of_q, f.fma(slope, of_v, old))
                 self.put(f, f"bar difference{k}", r, f.select(mask, new, old))
@@ -308,16 +310,16 @@ class Reverse(Recorded):
         active, zero = s.at > 0.5, f.const(0.0, DOUBLE, self.plan.vector)
         with f.each(self.rowcount) as r:
             for name in ("bar point", "point"):
-                for k in reversed(range(0 if name == "bar point" else 1, POINTS)):
+                for k in reversed(range(0 if name == "bar point" else 1, NODE_COUNT)):
                     for x in "qva":
                         new = self.vector(f, f"{name}{k - 1} {x}", r) if k else zero
                         self.put(f, f"{name}{k} {x}", r, f.select(active, new, self.vector(f, f"{name}{k} {x}", r)))
-        for k in reversed(range(1, POINTS)):
+        for k in reversed(range(1, NODE_COUNT)):
             for x in ("t", "solved"):
                 s.where(active, **{f"point{k}_{x}": getattr(s, f"point{k - 1}_{x}")})
         s.where(active, at=s.at - 1.0)
         with self.each_lane(f, active) as k:
-            self._load_point(f, k, self.lane_entry(f, "at", k) - float(POINTS - 1), "point0")
+            self._load_point(f, k, self.lane_entry(f, "at", k) - float(NODE_COUNT - 1), "point0")
             self._load_head(f, k)
 
     def _write_find_rows(self):
@@ -346,7 +348,7 @@ class Reverse(Recorded):
         member, row = self.to_int(f, self.lane_entry(f, "member", k)), self.lane_entry(f, "row", k)
         sampled = self.plan.sampled
         numbers = numbers_of_row(self, f, member, row) if sampled else self.member_address(f, "numbers", member)
-        f.call(PROLOGUE[REVERSE], numbers, constants, bars, number_bars)
+        f.call(PROLOGUE_NAMES[REVERSE], numbers, constants, bars, number_bars)
         if sampled:
             rows = (self.field(f, "knots") + 1) * len(sampled)
             output = f.at(self._result(f, "samplesbar", k, rows), self.to_int(f, row) * len(sampled))

@@ -3,7 +3,7 @@
 from udkjax.native.language.ir import Function
 from udkjax.native.module.layout import Lane, Plan
 from udkjax.native.module.program_derivative import ProgramDerivative
-from udkjax.native.module.programs import DIFFERENTIATED
+from udkjax.native.module.programs import DIFFERENTIATED_OUTPUTS
 from udkjax.native.run.trajectory import Trajectory
 
 
@@ -68,7 +68,7 @@ class Differentiated(Trajectory):
         if self.unrolled and self._shares_factors:
             names = ("accelerations", "projection")
             at = {f"stored {name}": (name, 0) for name in names} | self.arrays
-            program = self.unrolled.evaluations({name: DIFFERENTIATED[name] for name in names})
+            program = self.unrolled.evaluations({name: DIFFERENTIATED_OUTPUTS[name] for name in names})
             self.write_scalars(program, "evaluation_end", ("work", *names), at)
 
     @property

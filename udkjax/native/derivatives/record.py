@@ -17,31 +17,33 @@ from udkjax.native.module.running import Repeat
 from udkjax.native.module.samples import ARGUMENTS
 from udkjax.native.run.members import kept_outputs
 
-STORED = 200  # capacity in points of the record passed to the second call: as much memory as 300 outputs
+STORED_POINTS = 200  # capacity in points of the record passed to the second call: as much memory as 300 outputs
 PER_BREAKPOINT = 3  # additional capacity for each breakpoint: the beginning of a new run, and two steps
 FIRST_POINTS = 2  # points before the first step: the state as given, and projected
-TITLE = ("points", "kept", "written")  # before the points: their number, and the numbers of outputs that are kept and written
-HEAD = 3  # numbers of a point before its state: its time, the number of outputs before its step, `begin` of its step (layout.py)
-BEGIN = 2  # place of the last of them
+# Before the points: their number, and the numbers of outputs that are kept and written.
+HEADER_FIELDS = ("points", "kept", "written")
+# Numbers of a point before its state: its time, the number of outputs before its step, `begin` of its step (layout.py).
+POINT_HEADER_LENGTH = 3
+BEGIN_PLACE = 2  # place of the last of them
 # For threads of a GPU, whose records are in one buffer: its address, the capacity of each record, and the first of its members.
-BUFFER = ("records", "capacity", "first")
+BUFFER_FIELDS = ("records", "capacity", "first")
 
 
 def record_length(n: int, points: int) -> int:
     """Return the length of a record of `points` points with n coordinates."""
-    return len(TITLE) + points * row_length(n)
+    return len(HEADER_FIELDS) + points * row_length(n)
 
 
 def row_length(n: int) -> int:
     """Return the length of one point of a record, with n coordinates."""
-    return HEAD + 3 * n
+    return POINT_HEADER_LENGTH + 3 * n
 
 
 class Recorded(Differentiated):
     """A trajectory that returns a record, or backpropagates along a record."""
 
     lengths = ("given record", "record")
-    has_buffer = False  # whether records are in a buffer (`BUFFER`), not in memory that members allocate
+    has_buffer = False  # whether records are in a buffer (`BUFFER_FIELDS`), not in memory that members allocate
 
     def __init__(self, plan: Plan, active: tuple[bool, ...]):
         super().__init__(plan, active)
@@ -52,7 +54,7 @@ class Recorded(Differentiated):
     @property
     def call_fields(self) -> tuple[str, ...]:
         *fields, following = super().call_fields
-        return (*fields, *(BUFFER if self.has_buffer else ()), following)
+        return (*fields, *(BUFFER_FIELDS if self.has_buffer else ()), following)
 
     def backpropagates(self, f: Function) -> Value:
         """Return true if this is the second call, which has cotangents and backpropagates."""
@@ -71,9 +73,9 @@ class Recorded(Differentiated):
         with f.if_(self.field(f, "given record length") > 0):
             given = self.member_address(f, "given record", member)
             with f.if_(f.load(given) > 0.0):
-                for k, name in enumerate(TITLE):
+                for k, name in enumerate(HEADER_FIELDS):
                     self.put_lane_entry(f, name, lane, f.load(given, k))
-                self.put_lane_entry(f, "record", lane, f.at(given, len(TITLE)), base=POINTER)
+                self.put_lane_entry(f, "record", lane, f.at(given, len(HEADER_FIELDS)), base=POINTER)
                 self.stiffness.if_leaving(lambda: self._leave_for_implicit_steps(f, lane))
                 for name, x in (("active", 0.0), ("ready", 1.0), ("given", 1.0)):
                     self.put_lane_entry(f, name, lane, x)
@@ -90,7 +92,7 @@ class Recorded(Differentiated):
     def _leave_for_implicit_steps(self, f: Function, k: Value):
         """Let lane k leave the module if a step of its record is implicit."""
         points = self.to_int(f, self.lane_entry(f, "points", k))
-        with f.each(points) as i, f.if_(f.load(self._record(f, k), i * self.row + BEGIN) < -0.5):
+        with f.each(points) as i, f.if_(f.load(self._record(f, k), i * self.row + BEGIN_PLACE) < -0.5):
             self.put_lane_entry(f, "stiff", k, 1.0)
 
     def record_step(self, f: Function, s: Lane, accept: Value):
@@ -109,8 +111,10 @@ class Recorded(Differentiated):
 
     def _place_in_output(self, f: Function, k: Value, member: Value):
         length = self.field(f, "record length")
-        self.put_lane_entry(f, "record", k, f.at(self.result_address(f, "record", member, length), len(TITLE)), base=POINTER)
-        self.put_lane_entry(f, "capacity", k, f.like(f.arithmetic("div", length - len(TITLE), self.row), DOUBLE, 1))
+        self.put_lane_entry(
+            f, "record", k, f.at(self.result_address(f, "record", member, length), len(HEADER_FIELDS)), base=POINTER
+        )
+        self.put_lane_entry(f, "capacity", k, f.like(f.arithmetic("div", length - len(HEADER_FIELDS), self.row), DOUBLE, 1))
 
     def write_end_record(self):
         """Write `end_record(work, call, lane)`: write the title of a lane's record to the output, and zeros after its points.
@@ -125,9 +129,9 @@ class Recorded(Differentiated):
         self.put_lane_entry(f, "points", k, f.select(fits, self.lane_entry(f, "points", k), 0.0))
         length = self.field(f, "record length")
         to = self.result_address(f, "record", self.to_int(f, self.lane_entry(f, "member", k)), length)
-        for j, name in enumerate(TITLE):
+        for j, name in enumerate(HEADER_FIELDS):
             f.store(self.lane_entry(f, name, k), to, j)
-        start = self.to_int(f, self.lane_entry(f, "points", k)) * self.row + len(TITLE)
+        start = self.to_int(f, self.lane_entry(f, "points", k)) * self.row + len(HEADER_FIELDS)
         registers = f.arithmetic("div", length - start, vector)
         with f.each(registers) as r:
             f.store(0.0, to, r * vector + start, vector)
@@ -232,7 +236,7 @@ class Recorded(Differentiated):
             for j, name in enumerate(("point3_t", "written", "begin")):
                 f.store(self.lane_entry(f, name, k), row, j)
             for j, x in enumerate("qva"):
-                self.copy_lane(f, row, HEAD + j * self.n, f"point3 {x}", k)
+                self.copy_lane(f, row, POINT_HEADER_LENGTH + j * self.n, f"point3 {x}", k)
             self.put_lane_entry(f, "points", k, points + 1.0)
 
     def _load_point(self, f: Function, k: Value, number: Value, point: str):
@@ -242,7 +246,7 @@ class Recorded(Differentiated):
         self.put_lane_entry(f, f"{point}_solved", k, f.max(-f.load(row, 2), 0.0))
         for j, x in enumerate("qva"):
             with f.each(self.n) as i:
-                self.put_lane_entry(f, f"{point} {x}", k, f.load(row, i + (HEAD + j * self.n)), i)
+                self.put_lane_entry(f, f"{point} {x}", k, f.load(row, i + (POINT_HEADER_LENGTH + j * self.n)), i)
 
     def _load_head(self, f: Function, k: Value):
         """Load the head of the current point of lane k: the number of outputs `before` its step, and `begin`."""

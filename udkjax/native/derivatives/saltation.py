@@ -12,17 +12,17 @@ length leads across (run/pieces.py), so that [a' x] is the difference of the tan
 from udkjax.expressions.loops.loop_derivative import TWICE
 from udkjax.native.derivatives.differentiated import Differentiated
 from udkjax.native.language.ir import DOUBLE, POINTER, Value
-from udkjax.native.module.steps import EDGE
+from udkjax.native.module.steps import EDGE_STEP
 
-MOTION, BEFORE = "tangents of the motion", "linearization before"  # arrays
+MOTION_TANGENTS, LINEARIZATION_BEFORE = "tangents of the motion", "linearization before"  # arrays
 AFTER_STEP, BEFORE_STEP = "difference0", "difference1"  # tangents of accelerations along the motion
-NO_JUMP = 100 * EDGE  # a smaller relative difference is no jump: a step across takes EDGE of an ordinary step
+NO_JUMP = 100 * EDGE_STEP  # a smaller relative difference is no jump: a step across takes EDGE_STEP of an ordinary step
 
 
 def add_memory(module: Differentiated):
     """Reserve memory for the linearization before a step across, and for three tangents, the first of which is the motion."""
-    module.places.add(BEFORE, module.of_accelerations.stored)
-    module.places.add(MOTION, len(module.ways) * module.tangents.size * (module.tangents.width // module.plan.width))
+    module.places.add(LINEARIZATION_BEFORE, module.of_accelerations.stored)
+    module.places.add(MOTION_TANGENTS, len(module.ways) * module.tangents.size * (module.tangents.width // module.plan.width))
 
 
 def write_saltation(module: Differentiated):
@@ -39,7 +39,7 @@ def _write_along_motion(module: Differentiated):
     The state is point 3, where the accelerations have been evaluated, and is so again afterwards.
     """
     f, s = module.function("along_motion")
-    f.given["tangent"] = module.address(f, MOTION)
+    f.given["tangent"] = module.address(f, MOTION_TANGENTS)
 
     def differentiate(point: str, stored: str, to: str):
         with f.each(module.n) as i:
@@ -56,8 +56,8 @@ def _write_along_motion(module: Differentiated):
 
     differentiate("point3", f"stage{module.last} linearization", AFTER_STEP)
     go_to("point2")
-    module.evaluate_settled(f, "corrected q", BEFORE)
-    differentiate("point2", BEFORE, BEFORE_STEP)
+    module.evaluate_settled(f, "corrected q", LINEARIZATION_BEFORE)
+    differentiate("point2", LINEARIZATION_BEFORE, BEFORE_STEP)
     go_to("point3")
 
 
@@ -69,7 +69,7 @@ def _write_jump(module: Differentiated):
     f, s = module.function("jump", ((POINTER, "work"), (POINTER, "tangent")))
     first, width, size = f.given["tangent"], module.tangents.width, module.tangents.size * module.tangents.width
     x, y, both = (f.at(first, k * size) for k in range(3))
-    changes = {"x": (x, "point2 a"), "y": (y, "point2 a"), "f": (module.address(f, MOTION), BEFORE_STEP)}
+    changes = {"x": (x, "point2 a"), "y": (y, "point2 a"), "f": (module.address(f, MOTION_TANGENTS), BEFORE_STEP)}
 
     def ends(name: str, i: Value) -> tuple[Value, Value]:
         """Return the tangents of an acceleration before and after the step."""

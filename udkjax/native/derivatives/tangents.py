@@ -19,10 +19,10 @@ from udkjax.expressions.loops.loop_derivative import FORWARD
 from udkjax.native.derivatives.differentiated import Differentiated
 from udkjax.native.language.ir import DOUBLE, INT, POINTER, Function, Value
 from udkjax.native.module.layout import Lane, Layout, Plan
-from udkjax.native.module.program_derivative import GIVEN
-from udkjax.native.module.prologue import PROLOGUE, write_prologue_derivative
+from udkjax.native.module.program_derivative import GIVEN_DIRECTIONS
+from udkjax.native.module.prologue import PROLOGUE_NAMES, write_prologue_derivative
 from udkjax.native.module.samples import row_address
-from udkjax.native.module.steps import POINTS
+from udkjax.native.module.steps import NODE_COUNT
 from udkjax.native.module.tableau import Method
 from udkjax.native.run.dense_output import write_between, write_differences
 from udkjax.native.run.members import kept_outputs
@@ -44,7 +44,7 @@ class Forward(Differentiated):
 
     def __init__(self, plan: Plan, active: tuple[bool, ...], lanes: int):
         super().__init__(plan, active)
-        input_ways = [way for way in self.ways if way in GIVEN]
+        input_ways = [way for way in self.ways if way in GIVEN_DIRECTIONS]
         names = [f"{way}samples" for way in input_ways if plan.sampled] + [
             f"{way}{x}" for way in input_ways for x in ("numbers", "q", "v")
         ]
@@ -54,12 +54,12 @@ class Forward(Differentiated):
         w.add("constants", self.count)
         for name in ("state q", "state v", "result q", "result v"):
             w.add(name, self.n)
-        for k in range(POINTS):
+        for k in range(NODE_COUNT):
             for x in "qva":
                 w.add(f"point{k} {x}", self.n)
         for i in range(1, self.stages):
             w.add(f"stage{i} a", self.n)
-        for k in range(3 * POINTS):
+        for k in range(3 * NODE_COUNT):
             w.add(f"difference{k}", self.n)
 
     def write_derivatives(self):
@@ -137,7 +137,7 @@ class Forward(Differentiated):
         """
         name, method, h, mask = f"stage{i} a", self.stiffness.method, self.broadcast(f, s.step), s.stepping > 0.5
         self._evaluate_solved(f, i)
-        for ways in ([way for way in self.ways if way in GIVEN], self.ways[-1:]):
+        for ways in ([way for way in self.ways if way in GIVEN_DIRECTIONS], self.ways[-1:]):
             with self._each_group(f):
                 for way in ways:  # the tangent of the state must not contain the tangent of this stage
                     with self._in_way(f, way), f.each(self.registers("tangent")) as r:
@@ -192,7 +192,7 @@ class Forward(Differentiated):
         step = f.select(s.begin > 0.5, 0.0, s.t1 - s.point2_t)
         h, begin = self.broadcast(f, step), s.begin > 0.5
         with self._each_tangent(f), f.each(self.registers("tangent")) as r:
-            for k in range(POINTS - 1):
+            for k in range(NODE_COUNT - 1):
                 for x in "qva":
                     old_point, next_point = (self.vector(f, f"point{j} {x}", r, "tangent") for j in (k, k + 1))
                     self.put(f, f"point{k} {x}", r, f.select(accept, next_point, old_point), "tangent")
@@ -296,8 +296,10 @@ class Forward(Differentiated):
             with f.each(self.code.number_count) as i:
                 f.store(0.0, zeros, i)
         with self._each_group(f) as p, self._each_direction(f, p, lane) as (direction, tangent_lane):
-            inputs = [self._changes_of_numbers(f, way, member, direction) if way in GIVEN else zeros for way in self.ways]
-            f.call(PROLOGUE[self.mode], numbers, constants, *inputs, *tangents)
+            inputs = [
+                self._changes_of_numbers(f, way, member, direction) if way in GIVEN_DIRECTIONS else zeros for way in self.ways
+            ]
+            f.call(PROLOGUE_NAMES[self.mode], numbers, constants, *inputs, *tangents)
             for way, changes in zip(self.ways, tangents, strict=True):
                 with f.each(self.count) as i:
                     f.store(f.load(changes, i), self._way(f, way), tangent_lane + self.place("constants", i, "tangent"))
@@ -325,9 +327,12 @@ class Forward(Differentiated):
         with self._each_group(f) as p, self._each_direction(f, p, lane) as (direction, place):
             for way in self.ways:
                 tangent = self._way(f, way)
-                self._read_state(f, way, member, direction, tangent, place, [f"point{k}" for k in range(POINTS)])
+                self._read_state(f, way, member, direction, tangent, place, [f"point{k}" for k in range(NODE_COUNT)])
                 with f.each(self.n) as i:
-                    for name in (*(f"point{k} a" for k in range(POINTS)), *(f"stage{j} a" for j in range(1, self.stages))):
+                    for name in (
+                        *(f"point{k} a" for k in range(NODE_COUNT)),
+                        *(f"stage{j} a" for j in range(1, self.stages)),
+                    ):
                         f.store(0.0, tangent, place + self.place(name, i, "tangent"))
 
     def _read_state(
@@ -338,7 +343,7 @@ class Forward(Differentiated):
         `place` is the lane of the direction in the tangent. Tangents along both of a pair of directions are zero.
         """
         for x in "qv":
-            start = self.member_address(f, f"{way}{x}", member) if way in GIVEN else None
+            start = self.member_address(f, f"{way}{x}", member) if way in GIVEN_DIRECTIONS else None
             with f.each(self.n) as i:
                 change = f.load(start, direction * self.n + i) if start else f.const(0.0)
                 for array in to:

@@ -11,7 +11,7 @@ from functools import cache
 from threading import Lock
 from typing import Any
 
-LIBRARY = "nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1"
+DRIVER_LIBRARY = "nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1"
 
 
 class CudaError(RuntimeError):
@@ -99,6 +99,6 @@ class CudaDriver:
 def driver() -> CudaDriver | None:
     """Return the driver of this machine; None if there is no driver or no device."""
     try:
-        return CudaDriver(ctypes.CDLL(LIBRARY))
+        return CudaDriver(ctypes.CDLL(DRIVER_LIBRARY))
     except (OSError, CudaError):
         return None

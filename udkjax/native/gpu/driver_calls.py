@@ -8,11 +8,11 @@ from udkjax.native.host.ffi import CONTEXT, CREATE_ERROR, INTERNAL, STREAM, argu
 from udkjax.native.language.ir import INT, POINTER, Function, Value
 
 PLATFORM = "CUDA"  # XLA's name of the platform
-CONTEXT_OF_STREAM, PUSH, POP = "cuStreamGetCtx", "cuCtxPushCurrent_v2", "cuCtxPopCurrent_v2"
-TO_HOST, TO_DEVICE, WAIT = "cuMemcpyDtoHAsync_v2", "cuMemcpyHtoDAsync_v2", "cuStreamSynchronize"
-DESCRIBE = "cuGetErrorString"
-GIVEN = 24  # offset in bytes of the first number in a struct of arguments of XLA's functions, after the context
-UNKNOWN = b"the driver does not say why"
+CONTEXT_OF_STREAM, PUSH_CONTEXT, POP_CONTEXT = "cuStreamGetCtx", "cuCtxPushCurrent_v2", "cuCtxPopCurrent_v2"
+COPY_TO_HOST, COPY_TO_DEVICE, WAIT_FOR_STREAM = "cuMemcpyDtoHAsync_v2", "cuMemcpyHtoDAsync_v2", "cuStreamSynchronize"
+DESCRIBE_ERROR = "cuGetErrorString"
+ARGUMENTS_OFFSET = 24  # offset in bytes of the first number in a struct of arguments of XLA's functions, after the context
+UNKNOWN_ERROR = b"the driver does not say why"
 MOST_WORDS = 400  # bytes of the driver's words in an error
 STRNCAT = "declare ptr @strncat(ptr, ptr, i64)"
 
@@ -26,7 +26,7 @@ class Words:
     """
 
     def __init__(self, functions: tuple[str, ...], further: tuple[str, ...]):
-        self.functions = (CONTEXT_OF_STREAM, PUSH, POP, DESCRIBE, *functions)
+        self.functions = (CONTEXT_OF_STREAM, PUSH_CONTEXT, POP_CONTEXT, DESCRIBE_ERROR, *functions)
         self.names = (*self.functions, *further)
 
     @property
@@ -57,9 +57,9 @@ class Words:
         """
         text, place = text_of(f, failed, MOST_WORDS), Value(f, f.reserve(POINTER), POINTER)
         f.store(Value(f, "null", POINTER), place, base=POINTER)
-        self.drive(f, DESCRIBE, answer, place)
+        self.drive(f, DESCRIBE_ERROR, answer, place)
         described = f.load(place, base=POINTER)
-        words = f.select(f.is_null(described), text_of(f, UNKNOWN), described)
+        words = f.select(f.is_null(described), text_of(f, UNKNOWN_ERROR), described)
         f.op(f"call ptr @strncat(ptr {text.name}, ptr {words.name}, i64 {MOST_WORDS - 8})", POINTER)
         f.declared.add(STRNCAT)
         return call_api(f, frame, CREATE_ERROR, text, f.const(INTERNAL, INT))
@@ -71,4 +71,4 @@ def stream_of(f: Function, frame: Value) -> Value:
     refused = call_with(f, frame, STREAM, asked)
     with f.if_(~f.is_null(refused)):
         f.leave(f"ptr {refused.name}")
-    return word(f, asked, GIVEN, POINTER)
+    return word(f, asked, ARGUMENTS_OFFSET, POINTER)

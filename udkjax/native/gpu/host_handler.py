@@ -19,14 +19,14 @@ import jax
 from udkjax.native.code import machine
 from udkjax.native.gpu.driver import CudaDriver, driver
 from udkjax.native.gpu.driver_calls import (
+    ARGUMENTS_OFFSET,
     CONTEXT_OF_STREAM,
-    GIVEN,
+    COPY_TO_DEVICE,
+    COPY_TO_HOST,
     PLATFORM,
-    POP,
-    PUSH,
-    TO_DEVICE,
-    TO_HOST,
-    WAIT,
+    POP_CONTEXT,
+    PUSH_CONTEXT,
+    WAIT_FOR_STREAM,
     Words,
     stream_of,
 )
@@ -46,18 +46,22 @@ from udkjax.native.host.ffi import (
     word,
 )
 from udkjax.native.language.ir import BOOL, INT, POINTER, Function, Value, Variable
-from udkjax.native.language.text import ALLOCATION, text_of_module
+from udkjax.native.language.text import ALLOCATION_DECLARATIONS, text_of_module
 from udkjax.threads import cores
 
 # The handler of the operation, the number of threads, and the address and the number of bytes of the pinned memory.
 HANDLER, THREADS, PINNED, PINNED_SIZE = "handler", "threads", "pinned", "pinned size"
-WORDS = Words((TO_HOST, TO_DEVICE, WAIT), (HANDLER, THREADS, PINNED, PINNED_SIZE))
+HANDLER_WORDS = Words((COPY_TO_HOST, COPY_TO_DEVICE, WAIT_FOR_STREAM), (HANDLER, THREADS, PINNED, PINNED_SIZE))
 BUFFER_BYTES = 48  # XLA_FFI_Buffer
 ALIGNMENT = 64  # of arrays, in bytes; as many precede the pinned memory, whose first number is 1 while it is in use
 PINNED_BYTES = 2**20
-PORTABLE = 1  # CU_MEMHOSTALLOC_PORTABLE: for all devices
-FAILED = b"copying between the graphics card and the host failed: "
-LIBC = (*ALLOCATION, "declare i32 @pthread_create(ptr, ptr, ptr, ptr)", "declare i32 @pthread_detach(i64)")
+PORTABLE_MEMORY = 1  # CU_MEMHOSTALLOC_PORTABLE: for all devices
+COPY_FAILED = b"copying between the graphics card and the host failed: "
+LIBC_DECLARATIONS = (
+    *ALLOCATION_DECLARATIONS,
+    "declare i32 @pthread_create(ptr, ptr, ptr, ptr)",
+    "declare i32 @pthread_detach(i64)",
+)
 
 
 def register(name: str, handler: int) -> str:
@@ -70,7 +74,7 @@ def register(name: str, handler: int) -> str:
         handler: the address of its handler.
     """
     copied, found = f"{name}_copied", driver()
-    with _REGISTERING:
+    with _REGISTERING_LOCK:
         if found is not None and copied not in _REGISTERED:
             library = load(found, handler)
             jax.ffi.register_ffi_target(copied, jax.ffi.pycapsule(ctypes.c_void_p(library["copy_and_call"])), platform=PLATFORM)
@@ -79,7 +83,7 @@ def register(name: str, handler: int) -> str:
 
 
 _REGISTERED: dict[str, machine.Library] = {}  # XLA may call these for as long as the process runs
-_REGISTERING = Lock()
+_REGISTERING_LOCK = Lock()
 
 
 def load(of: CudaDriver, handler: int, threads: int | None = None) -> machine.Library:
@@ -92,7 +96,7 @@ def load(of: CudaDriver, handler: int, threads: int | None = None) -> machine.Li
     """
     library = machine.library(module_text(), ("copy_and_call", "words"))
     pinned = _pinned(of)
-    WORDS.fill(library, of, handler, cores() if threads is None else threads, pinned, PINNED_BYTES if pinned else 0)
+    HANDLER_WORDS.fill(library, of, handler, cores() if threads is None else threads, pinned, PINNED_BYTES if pinned else 0)
     return library
 
 
@@ -102,7 +106,7 @@ def _pinned(of: CudaDriver) -> int:
     place = ctypes.c_int64()
     try:
         with of.current(_device()):
-            of("cuMemHostAlloc", ctypes.addressof(place), ALIGNMENT + PINNED_BYTES, PORTABLE)
+            of("cuMemHostAlloc", ctypes.addressof(place), ALIGNMENT + PINNED_BYTES, PORTABLE_MEMORY)
     except RuntimeError:  # the driver has no memory, or JAX does not compute on the card
         return 0
     ctypes.memset(place.value, 0, ALIGNMENT)
@@ -118,7 +122,7 @@ def _device() -> int:
 def module_text() -> str:
     """Return LLVM's text of the module with the handler, the same for all operations."""
     functions = [_thread_count(), _schedule(), _copy_and_call()]
-    return text_of_module(functions, [WORDS.text], LIBC)
+    return text_of_module(functions, [HANDLER_WORDS.text], LIBC_DECLARATIONS)
 
 
 def _copy_and_call() -> Function:
@@ -134,11 +138,11 @@ def _copy_and_call() -> Function:
     answer, error = _run(f, frame, on_host, stream)
     f.choose(
         is_pinned,
-        lambda: f.line(f"store atomic i64 0, ptr {WORDS.load(f, PINNED).name} seq_cst, align 8"),
+        lambda: f.line(f"store atomic i64 0, ptr {HANDLER_WORDS.load(f, PINNED).name} seq_cst, align 8"),
         lambda: f.line(f"call void @free(ptr {block.name})"),
     )
     with f.if_(answer.value.is_not(0)):
-        f.leave(f"ptr {WORDS.error(f, frame, FAILED, answer.value).name}")
+        f.leave(f"ptr {HANDLER_WORDS.error(f, frame, COPY_FAILED, answer.value).name}")
     f.line(f"ret ptr {error.value.name}")
     return f
 
@@ -146,8 +150,8 @@ def _copy_and_call() -> Function:
 def _block(f: Function, size: Value) -> tuple[Value, Value]:
     """Return the address of `size` bytes, or null; and whether they are in the pinned memory, which is then marked as in use."""
     block, is_pinned = f.variable(Value(f, "null", POINTER), POINTER, 1), f.variable(False, BOOL, 1)
-    pinned = WORDS.load(f, PINNED)
-    with f.if_(size <= WORDS.load(f, PINNED_SIZE, INT)):
+    pinned = HANDLER_WORDS.load(f, PINNED)
+    with f.if_(size <= HANDLER_WORDS.load(f, PINNED_SIZE, INT)):
         is_pinned.value = f.op(f"atomicrmw xchg ptr {pinned.name}, i64 1 seq_cst", INT).is_(0)
 
     def take():
@@ -235,7 +239,7 @@ def _run(f: Function, frame: Value, on_host: Value, stream: Value) -> tuple[Vari
         The first error number of the driver, 0 without an error; and the operation's error of XLA, null without an error.
     """
     place, error = Value(f, f.reserve(POINTER), POINTER), f.variable(Value(f, "null", POINTER), POINTER, 1)
-    answer = f.variable(WORDS.drive(f, CONTEXT_OF_STREAM, stream, place), INT, 1)
+    answer = f.variable(HANDLER_WORDS.drive(f, CONTEXT_OF_STREAM, stream, place), INT, 1)
 
     def copy(kind: int, function: str):
         (count, on_card), (_, copies) = _buffers(f, frame, kind), _buffers(f, on_host, kind)
@@ -243,28 +247,28 @@ def _run(f: Function, frame: Value, on_host: Value, stream: Value) -> tuple[Vari
             card, host = (f.load(x, k, base=POINTER) for x in (on_card, copies))
             size = _bytes(f, card)
             with f.if_(answer.value.is_(0) & (size > 0)):
-                ends = [word(f, x, DATA, POINTER) for x in ((host, card) if function == TO_HOST else (card, host))]
-                answer.value = WORDS.drive(f, function, *ends, size, stream)
-        waited = WORDS.drive(f, WAIT, stream)  # also after an error, for the copies before it
+                ends = [word(f, x, DATA, POINTER) for x in ((host, card) if function == COPY_TO_HOST else (card, host))]
+                answer.value = HANDLER_WORDS.drive(f, function, *ends, size, stream)
+        waited = HANDLER_WORDS.drive(f, WAIT_FOR_STREAM, stream)  # also after an error, for the copies before it
         answer.value = f.select(answer.value.is_(0), waited, answer.value)
 
     with f.if_(answer.value.is_(0)):
-        answer.value = WORDS.drive(f, PUSH, f.load(place, base=POINTER))
+        answer.value = HANDLER_WORDS.drive(f, PUSH_CONTEXT, f.load(place, base=POINTER))
         with f.if_(answer.value.is_(0)):
-            copy(ARGUMENTS, TO_HOST)
+            copy(ARGUMENTS, COPY_TO_HOST)
             with f.if_(answer.value.is_(0)):
-                handler = WORDS.load(f, HANDLER)
+                handler = HANDLER_WORDS.load(f, HANDLER)
                 error.value = f.op(f"call ptr {handler.name}(ptr {on_host.name})", POINTER)
                 with f.if_(f.is_null(error.value)):
-                    copy(RESULTS, TO_DEVICE)
-            WORDS.drive(f, POP, place)
+                    copy(RESULTS, COPY_TO_DEVICE)
+            HANDLER_WORDS.drive(f, POP_CONTEXT, place)
     return answer, error
 
 
 def _thread_count() -> Function:
     """Return a function in place of XLA_FFI_ThreadPool_NumThreads: it answers the number of threads in the word `THREADS`."""
     f = Function("thread_count", [(POINTER, "given")], returns="ptr", cold=True)
-    f.store(WORDS.load(f, THREADS, INT), word(f, f.given["given"], GIVEN, POINTER), base=INT)
+    f.store(HANDLER_WORDS.load(f, THREADS, INT), word(f, f.given["given"], ARGUMENTS_OFFSET, POINTER), base=INT)
     f.line("ret ptr null")
     return f
 
@@ -275,7 +279,7 @@ def _schedule() -> Function:
     If no thread can be started, the caller's thread runs the task.
     """
     f = Function("schedule", [(POINTER, "given")], returns="ptr", cold=True)
-    task, data = (word(f, f.given["given"], offset, POINTER) for offset in (GIVEN, GIVEN + 8))
+    task, data = (word(f, f.given["given"], offset, POINTER) for offset in (ARGUMENTS_OFFSET, ARGUMENTS_OFFSET + 8))
     thread = Value(f, f.reserve(INT), POINTER)
     # A thread's function returns a pointer, a task returns nothing: the pointer is never read.
     begun = f.op(f"call i32 @pthread_create(ptr {thread.name}, ptr null, ptr {task.name}, ptr {data.name})", "i32")

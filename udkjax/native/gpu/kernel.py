@@ -18,15 +18,15 @@ from udkjax.native.module.module import Module
 from udkjax.native.operations import Operation
 from udkjax.native.runs import RunStates
 
-NAME = "run_members"  # of the kernel
+KERNEL_NAME = "run_members"  # of the kernel
 # Coordinates whose numbers are read together, as a thread waits for memory most of the time. The paper's linkage is slower with 4
 # or 6.
-VECTOR = 2
+VECTOR_LENGTH = 2
 # The arguments of functions that point to the memory of a thread, or into it.
-LOCAL = ("work", "out", "tangent", "bar", "stored", "accelerations", "projection")
+LOCAL_POINTERS = ("work", "out", "tangent", "bar", "stored", "accelerations", "projection")
 # A barrier that also asks whether the condition holds in any thread of the block.
 ANY_OF_BLOCK = "{ .reg .pred p, q; setp.ne.u32 p, $1, 0; barrier.cta.red.or.pred q, 0, p; selp.u32 $0, 1, 0, q; }"
-KERNEL = f"""
+KERNEL_TEXT = f"""
 declare i32 @llvm.nvvm.read.ptx.sreg.tid.x()
 declare i32 @llvm.nvvm.read.ptx.sreg.ctaid.x()
 declare i32 @llvm.nvvm.read.ptx.sreg.ntid.x()
@@ -38,7 +38,7 @@ define i1 @meet(i1 %goes_on) alwaysinline {{
   ret i1 %result
 }}
 
-define ptx_kernel void @{NAME}(ptr byval([FIELDS x i64]) align 8 %call) {{
+define ptx_kernel void @{KERNEL_NAME}(ptr byval([FIELDS x i64]) align 8 %call) {{
   %thread = call i32 @llvm.nvvm.read.ptx.sreg.tid.x()
   %block = call i32 @llvm.nvvm.read.ptx.sreg.ctaid.x()
   %threads = call i32 @llvm.nvvm.read.ptx.sreg.ntid.x()
@@ -63,8 +63,8 @@ class KernelCode:
     @cached_property
     def text(self) -> str:
         """LLVM's text of the kernel."""
-        kernel = KERNEL.replace("FIELDS", str(len(self.module.call_fields))).replace("SIZE", str(self.code.size))
-        return self.functions_text(LOCAL) + kernel
+        kernel = KERNEL_TEXT.replace("FIELDS", str(len(self.module.call_fields))).replace("SIZE", str(self.code.size))
+        return self.functions_text(LOCAL_POINTERS) + kernel
 
     def functions_text(self, local: Collection[str]) -> str:
         """Return LLVM's text of the functions; `local` are the names of arguments that point to a thread's own memory."""
@@ -84,7 +84,7 @@ def kernel_code(operation: Operation, directions: int = 0, shares_numbers: bool 
     """
     if isinstance(operation, RunStates):  # the matrix of implicit steps would take most of the memory of a thread
         operation = replace(operation, changes=False, leaves=False)
-    module = operation.module(1, 1, VECTOR)
+    module = operation.module(1, 1, VECTOR_LENGTH)
     constants = 0
     if isinstance(module, Recorded):
         module.has_buffer = True

@@ -17,8 +17,8 @@ from udkjax.native.code import machine
 from udkjax.native.gpu import target
 from udkjax.native.gpu.driver import CudaDriver, driver
 from udkjax.native.gpu.driver_calls import PLATFORM
-from udkjax.native.gpu.kernel import NAME, KernelCode, kernel_code
-from udkjax.native.gpu.launch_handler import WORDS, launch_handler
+from udkjax.native.gpu.kernel import KERNEL_NAME, KernelCode, kernel_code
+from udkjax.native.gpu.launch_handler import LAUNCH_WORDS, launch_handler
 from udkjax.native.language.program import UnsupportedError
 from udkjax.native.language.text import text_of_module
 from udkjax.native.operations import Operation
@@ -28,9 +28,9 @@ from udkjax.threads import thread_count
 # Batches of fewer members for each core run on the host, unless `UDKJAX_KERNEL_MEMBERS` sets the smallest batch.
 MEMBERS_OF_CORE = 128
 MOST_MEMORY = 2**16  # bytes of a thread; the driver reserves them for each of the 270,000 threads that an H100 can hold
-TARGET = "udkjax_kernel_"  # prefix of the names of FFI targets
+TARGET_PREFIX = "udkjax_kernel_"  # prefix of the names of FFI targets
 # Attributes of a function and of a device (CUfunction_attribute, CUdevice_attribute).
-LOCAL_BYTES, MAJOR, MINOR, MULTIPROCESSORS, THREADS_EACH = 3, 75, 76, 16, 39
+LOCAL_BYTES, MAJOR, MINOR, MULTIPROCESSORS, THREADS_PER_MULTIPROCESSOR = 3, 75, 76, 16, 39
 
 
 def kernel_members() -> float:
@@ -71,10 +71,10 @@ def _load(operation: Operation, directions: int, shares_numbers: bool) -> str | 
     code, found = kernel_code(operation, directions, shares_numbers), driver()
     if 8 * code.code.size > MOST_MEMORY:
         return None
-    name = f"{TARGET}{machine.digest(code.text)}"
+    name = f"{TARGET_PREFIX}{machine.digest(code.text)}"
     if found is None:
         return name
-    with _REGISTERING:
+    with _REGISTERING_LOCK:
         if name not in _REGISTERED:
             loaded = load_kernel(found, code)
             if loaded is None or not _has_memory(found, loaded):
@@ -86,14 +86,14 @@ def _load(operation: Operation, directions: int, shares_numbers: bool) -> str | 
 
 
 _REGISTERED: dict[str, machine.Library] = {}  # XLA may call these for as long as the process runs
-_REGISTERING = Lock()
+_REGISTERING_LOCK = Lock()
 _reserved: dict[int, int] = {}  # bytes of all threads' memory that the driver holds, by device
 
 
 def load_kernel(of: CudaDriver, code: KernelCode) -> int | None:
     """Compile and load a kernel; return its handle for all devices. None if the driver or a device is too old for the kernel."""
     kinds = {(of.attribute(MAJOR, k), of.attribute(MINOR, k)) for k in range(of.device_count())}
-    if min(kinds) < target.OLDEST:
+    if min(kinds) < target.OLDEST_CAPABILITY:
         return None
     library, kernel = ctypes.c_void_p(), ctypes.c_void_p()
     # If `ptxas` refuses the kernel, or is newer than the driver, the driver assembles it.
@@ -101,7 +101,7 @@ def load_kernel(of: CudaDriver, code: KernelCode) -> int | None:
         try:
             image = target.compile_kernel(code.text, min(kinds), is_assembled)
             of("cuLibraryLoadData", ctypes.addressof(library), image, 0, 0, 0, 0, 0, 0)
-            of("cuLibraryGetKernel", ctypes.addressof(kernel), library, NAME.encode())
+            of("cuLibraryGetKernel", ctypes.addressof(kernel), library, KERNEL_NAME.encode())
         except AttributeError:  # a driver of CUDA 11
             return None
         except RuntimeError:
@@ -117,7 +117,7 @@ def _has_memory(of: CudaDriver, kernel: int) -> bool:
             size, free, total = ctypes.c_int(), ctypes.c_size_t(), ctypes.c_size_t()
             of("cuKernelGetAttribute", ctypes.addressof(size), LOCAL_BYTES, kernel, k)
             of("cuMemGetInfo_v2", ctypes.addressof(free), ctypes.addressof(total))
-            needed = size.value * of.attribute(MULTIPROCESSORS, k) * of.attribute(THREADS_EACH, k)
+            needed = size.value * of.attribute(MULTIPROCESSORS, k) * of.attribute(THREADS_PER_MULTIPROCESSOR, k)
             if needed - _reserved.get(k, 0) > free.value:
                 return False
             _reserved[k] = max(needed, _reserved.get(k, 0))
@@ -126,7 +126,7 @@ def _has_memory(of: CudaDriver, kernel: int) -> bool:
 
 def load_handler(of: CudaDriver, code: KernelCode, kernel: int) -> machine.Library:
     """Return the loaded code of the handler `launch(frame)` for a kernel, which is given by its code and its handle."""
-    text = text_of_module([launch_handler(code)], [WORDS.text])
+    text = text_of_module([launch_handler(code)], [LAUNCH_WORDS.text])
     library = machine.library(text, ("launch", "words"))
-    WORDS.fill(library, of, kernel)
+    LAUNCH_WORDS.fill(library, of, kernel)
     return library

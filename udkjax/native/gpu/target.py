@@ -12,10 +12,10 @@ from pathlib import Path
 from udkjax.native.code import code_cache, machine
 
 TRIPLE = "nvptx64-nvidia-cuda"
-PTX = "+ptx78"  # the version, of CUDA 11.8: the first for sm_90
-OLDEST = (7, 0)  # compute capability: the first whose threads part and meet freely
-NEWEST = (9, 0)  # the newest capability in this version of PTX, which later GPUs accept as well
-LEVEL = 2  # of LLVM's code generation
+PTX_VERSION = "+ptx78"  # the version, of CUDA 11.8: the first for sm_90
+OLDEST_CAPABILITY = (7, 0)  # compute capability: the first whose threads part and meet freely
+NEWEST_CAPABILITY = (9, 0)  # the newest capability in this version of PTX, which later GPUs accept as well
+OPTIMIZATION_LEVEL = 2  # of LLVM's code generation
 # Functions are called, not inlined: an inlined copy takes room in the instruction cache. LLVM's combination of instructions
 # would remove the casts that mark pointers to a thread's own memory.
 PASSES = machine.PASSES
@@ -31,19 +31,23 @@ def compile_kernel(text: str, capability: tuple[int, int], is_assembled: bool = 
             the result is PTX for this capability and later ones, which the driver assembles in seconds whenever it loads it.
     """
     assembler = ptxas() if is_assembled else None
-    key = machine.digest("\0".join((TRIPLE, str(capability), PTX, *PASSES, str(LEVEL), _version(assembler), text)))
+    key = machine.digest(
+        "\0".join((TRIPLE, str(capability), PTX_VERSION, *PASSES, str(OPTIMIZATION_LEVEL), _version(assembler), text))
+    )
     code = code_cache.read(key)
     if code is None:
-        source = ptx(text, min(capability, NEWEST))
+        source = ptx(text, min(capability, NEWEST_CAPABILITY))
         code = assemble(source, capability, assembler) if assembler else source.encode() + b"\0"
         code_cache.write(key, code)
     return code
 
 
-def ptx(text: str, capability: tuple[int, int] = NEWEST) -> str:
+def ptx(text: str, capability: tuple[int, int] = NEWEST_CAPABILITY) -> str:
     """Return the PTX of LLVM's text of a kernel, for a compute capability and later ones."""
     llvm = machine.llvm_for_all_targets()
-    compiler = llvm.Target.from_triple(TRIPLE).create_target_machine(cpu=_name(capability), features=PTX, opt=LEVEL)
+    compiler = llvm.Target.from_triple(TRIPLE).create_target_machine(
+        cpu=_name(capability), features=PTX_VERSION, opt=OPTIMIZATION_LEVEL
+    )
     with machine.optimized(text, compiler, TRIPLE, PASSES) as module:
         return compiler.emit_assembly(module)
 

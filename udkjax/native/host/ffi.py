@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from udkjax.native.language.ir import INT, POINTER, Function, Value
-from udkjax.native.module.layout import INPUTS, SHARE
+from udkjax.native.module.layout import INPUTS, MEMBERS_PER_THREAD
 from udkjax.native.module.memory import Memory
 from udkjax.threads import thread_limit
 
@@ -28,10 +28,10 @@ DATA, RANK, DIMS = 24, 32, 40
 METADATA, MAJOR, MINOR = 24, 24, 28
 VERSION = (0, 1)  # major, minor
 # Words of the work that threads share: the number of threads that may still access the work, the number that have started (plus
-# CLOSED once no more may start), the number that have finished, the next member, whether memory was refused, and the call record
-# of `run`.
-USERS, BEGUN, ENDED, NEXT, REFUSED, CALL = range(6)
-CLOSED = 2**32
+# CLOSED_MARK once no more may start), the number that have finished, the next member, whether memory was refused, and the call
+# record of `run`.
+USERS, THREADS_BEGUN, THREADS_ENDED, NEXT_MEMBER, MEMORY_REFUSED, CALL = range(6)
+CLOSED_MARK = 2**32
 RESOURCE_EXHAUSTED, INTERNAL = 8, 13  # XLA_FFI_Error_Code
 NO_MEMORY = b"no memory for a computation by machine code"
 
@@ -50,7 +50,7 @@ def handler(module: Memory, name: str) -> list[Function]:
     for k in range(2):
         f.store(0, progress, k, base=INT)
     f.store(progress, call, module.call_fields.index("next"), base=POINTER)
-    shares = f.arithmetic("div", members, SHARE)
+    shares = f.arithmetic("div", members, MEMBERS_PER_THREAD)
     threads = f.variable(1, INT, 1)
     with f.if_(shares > 1):
         threads.value = _thread_count(f, frame)
@@ -176,9 +176,9 @@ def _help() -> Function:
     """Return the function `help(work)`: a thread of the pool calls it to join a run, unless the work is closed."""
     f = Function("help", [(POINTER, "work")], cold=True)
     work = f.given["work"]
-    with f.if_(_add(f, work, BEGUN, 1) < CLOSED):
+    with f.if_(_add(f, work, THREADS_BEGUN, 1) < CLOSED_MARK):
         f.call("run", f.at(work, CALL, "i64"))
-        _add(f, work, ENDED, 1)
+        _add(f, work, THREADS_ENDED, 1)
     _leave(f, work)
     return f
 
@@ -192,11 +192,11 @@ def _run_shared(f: Function, frame: Value, call: Value, count: int, helpers: Val
 def _share(f: Function, frame: Value, call: Value, count: int, helpers: Value, work: Value):
     """Set up the memory `work` for `_run_shared`, start the helpers, run members, and wait for the helpers that have started."""
     f.store(helpers + 1, work, USERS, base=INT)
-    for k in (BEGUN, ENDED, NEXT, REFUSED):
+    for k in (THREADS_BEGUN, THREADS_ENDED, NEXT_MEMBER, MEMORY_REFUSED):
         f.store(0, work, k, base=INT)
     with f.each(count - 1) as k:  # all but the last field, the address of the next member
         f.store(f.load(call, k, base=INT), work, k + CALL, base=INT)
-    f.store(f.at(work, NEXT, "i64"), work, CALL + count - 1, base=POINTER)
+    f.store(f.at(work, NEXT_MEMBER, "i64"), work, CALL + count - 1, base=POINTER)
     context, task = word(f, frame, CONTEXT, POINTER), f.op("getelementptr i8, ptr @help, i64 0", POINTER)
     with f.each(helpers):
         error = call_api(f, frame, SCHEDULE, context, task, work)
@@ -204,8 +204,8 @@ def _share(f: Function, frame: Value, call: Value, count: int, helpers: Value, w
             call_api(f, frame, DESTROY_ERROR, error)
             _add(f, work, USERS, -1)
     f.call("run", f.at(work, CALL, "i64"))
-    begun = _add(f, work, BEGUN, CLOSED)
-    with f.while_(lambda: _add(f, work, ENDED, 0) < begun):
+    begun = _add(f, work, THREADS_BEGUN, CLOSED_MARK)
+    with f.while_(lambda: _add(f, work, THREADS_ENDED, 0) < begun):
         pass
-    f.store(f.load(work, REFUSED, base=INT), f.load(call, count - 1, base=POINTER), 1, base=INT)
+    f.store(f.load(work, MEMORY_REFUSED, base=INT), f.load(call, count - 1, base=POINTER), 1, base=INT)
     _leave(f, work)

@@ -29,7 +29,7 @@ from udkjax.programs.deferred import deferred_p
 LOOPS = {"scan", "while"}
 FACTORIZATIONS = {"cholesky", "eig", "eigh", "hessenberg", "householder_product", "lu", "qr", "geqrf", "geqp3", "schur", "svd"}
 HOST = "cpu"  # the platform for which a program is a part of the program around it
-SMALL = 2**14  # for fewer numbers than this, the host completes an operation before a card has started it
+FEW_NUMBERS = 2**14  # for fewer numbers than this, the host completes an operation before a card has started it
 FEW_MATRICES = 64  # the host takes some 10 us for each factorization, a card half a millisecond for any number of them
 
 
@@ -90,7 +90,7 @@ def _is_slow(jaxpr: Any) -> bool:
     """Return True if a program has loops over operations on small arrays, or factorizations of a few matrices."""
     for equation in jaxpr.eqns:
         name, inner = equation.primitive.name, list(jaxprs_in_params(equation.params))
-        if name in LOOPS and max(map(_largest, inner)) <= SMALL:
+        if name in LOOPS and max(map(_largest, inner)) <= FEW_NUMBERS:
             return True
         if name in FACTORIZATIONS and math.prod(equation.invars[0].aval.shape[:-2]) <= FEW_MATRICES:
             return True

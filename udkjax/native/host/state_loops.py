@@ -22,8 +22,8 @@ from udkjax.native.language.program import UnsupportedError
 from udkjax.native.language.text import text_of_module
 
 # A product and a sum. The product is rounded first, as by the floats of Python that run the same before it is compiled.
-_FUSED = re.compile(r"(%\S+) = call double @llvm\.fmuladd\.f64\(double (\S+), double (\S+), double (\S+)\)")
-_ROUNDED = r"\1.product = fmul double \2, \3\n  \1 = fadd double \1.product, \4"
+_FUSED_MULTIPLY_ADD = re.compile(r"(%\S+) = call double @llvm\.fmuladd\.f64\(double (\S+), double (\S+), double (\S+)\)")
+_ROUNDED_MULTIPLY_ADD = r"\1.product = fmul double \2, \3\n  \1 = fadd double \1.product, \4"
 
 
 class StateLoops:
@@ -42,8 +42,8 @@ class StateLoops:
         loops = LoopWriter(1)
         at = {name: ("work", place) for name, place in places.items()} | {"constants": ("constants", 0)}
         loops.write(program, "evaluate", ("constants", "work"), at)
-        text = _FUSED.sub(_ROUNDED, text_of_module(loops.functions, loops.globals))
-        self._library = machine.library(text, ["evaluate"], machine.QUICK)
+        text = _FUSED_MULTIPLY_ADD.sub(_ROUNDED_MULTIPLY_ADD, text_of_module(loops.functions, loops.globals))
+        self._library = machine.library(text, ["evaluate"], machine.QUICK_LEVEL)
         self._run = machine.function(self._library["evaluate"], ctypes.c_void_p, ctypes.c_void_p)
         self._work, self._lock = np.zeros(max(ends[-1], 1)), Lock()
         self._address = self._work.__array_interface__["data"][0]

@@ -16,17 +16,17 @@ from udkjax.expressions.scalars.program_pieces import LONGEST, ProgramPiece, pie
 from udkjax.native.language import elementary
 from udkjax.native.language.ir import BOOL, DOUBLE, INT, POINTER, Function, Value, llvm_type
 
-SIN = [(-1) ** k / math.factorial(2 * k + 1) for k in range(9)]
-COS = [(-1) ** k / math.factorial(2 * k) for k in range(10)]
+SIN_COEFFICIENTS = [(-1) ** k / math.factorial(2 * k + 1) for k in range(9)]
+COS_COEFFICIENTS = [(-1) ** k / math.factorial(2 * k) for k in range(10)]
 # pi / 2: the first three parts have 23 digits; their multiples up to 2^30 are exact, whether or not multiplications are fused.
 HALF_PI = tuple(
     map(float.fromhex, ("0x1.921fb40000000p+0", "0x1.4442d00000000p-24", "0x1.8469880000000p-48", "0x1.8cc51701b839ap-72"))
 )
-ROUND = 1.5 * 2.0**52  # added to a number, leaves the nearest integer in the last digits of the sum
-PASSED = "passed"  # the pointer to what the pieces of a long program pass on
+ROUNDING_SHIFT = 1.5 * 2.0**52  # added to a number, leaves the nearest integer in the last digits of the sum
+PASSED_POINTER = "passed"  # the pointer to what the pieces of a long program pass on
 _ARITHMETIC = ("add", "sub", "mul", "div")
-_COMPARED = ("lt", "le", "gt", "ge", "eq", "ne")
-_INTRINSIC = {"abs": "fabs", "floor": "floor", "ceil": "ceil", "max": "maximum", "min": "minimum"}
+_COMPARISONS = ("lt", "le", "gt", "ge", "eq", "ne")
+_INTRINSIC_NAMES = {"abs": "fabs", "floor": "floor", "ceil": "ceil", "max": "maximum", "min": "minimum"}
 
 
 class UnsupportedError(ValueError):
@@ -103,9 +103,9 @@ def write(
         return f
     passed = Value(f, f.reserve(llvm_type(DOUBLE, widest), shared), POINTER)
     for k, piece in enumerate(pieces):
-        part = Function(f"{name}_piece{k}", [*arguments, (POINTER, PASSED)], width, cold=cold)
+        part = Function(f"{name}_piece{k}", [*arguments, (POINTER, PASSED_POINTER)], width, cold=cold)
         part.noinline = True
-        fill(part, piece, part.given[PASSED])
+        fill(part, piece, part.given[PASSED_POINTER])
         f.evaluated |= part.evaluated | {part.name: part}
         f.call(part.name, *(f.given[x] for x in pointers), passed)
     return f
@@ -288,11 +288,11 @@ def apply(f: Function, name: str, parameters: Mapping[str, Any], a: list[Value],
             return _convert(f, a[0], parameters["new_dtype"])
         case "copy" | "copy_p" | "stop_gradient":
             return a[0]
-        case _ if name in _COMPARED:
+        case _ if name in _COMPARISONS:
             return f.compare(name, *a)
-        case _ if name in _INTRINSIC and all(x.base == DOUBLE for x in a):
-            return f.intrinsic(_INTRINSIC[name], *a)
-        case _ if name in elementary.NAMES and all(x.base == DOUBLE for x in a):
+        case _ if name in _INTRINSIC_NAMES and all(x.base == DOUBLE for x in a):
+            return f.intrinsic(_INTRINSIC_NAMES[name], *a)
+        case _ if name in elementary.FUNCTION_NAMES and all(x.base == DOUBLE for x in a):
             return elementary.call(f, name, *a)
         case _:
             raise UnsupportedError(name)
@@ -359,18 +359,18 @@ def integer_power(a: Value, n: int) -> Value:
 def sincos(f: Function, a: Value) -> tuple[Value, Value]:
     """Return sine and cosine, exact up to rounding, by one reduction to within pi / 4 and two polynomials; no library calls."""
     width, T, integers = a.width, a.type, llvm_type(INT, a.width)
-    shifted = f.fma(a, 2 / math.pi, ROUND)
-    turns = f.op(f"fsub {T} {shifted.name}, {f.const(ROUND, DOUBLE, width).name}", DOUBLE, width)
+    shifted = f.fma(a, 2 / math.pi, ROUNDING_SHIFT)
+    turns = f.op(f"fsub {T} {shifted.name}, {f.const(ROUNDING_SHIFT, DOUBLE, width).name}", DOUBLE, width)
     x = a
     for part in HALF_PI:
         x = f.fma(turns, -part, x)
     y = x * x
-    s, c = f.const(SIN[8], DOUBLE, width), f.const(COS[9], DOUBLE, width)
+    s, c = f.const(SIN_COEFFICIENTS[8], DOUBLE, width), f.const(COS_COEFFICIENTS[9], DOUBLE, width)
     for k in range(7, 0, -1):
-        s = f.fma(s, y, SIN[k])
+        s = f.fma(s, y, SIN_COEFFICIENTS[k])
     s = f.fma(s, y * x, x)
     for k in range(8, -1, -1):
-        c = f.fma(c, y, COS[k])
+        c = f.fma(c, y, COS_COEFFICIENTS[k])
     quarter = f.op(f"bitcast {T} {shifted.name} to {integers}", INT, width)
 
     def bit(j: Value, mask: int) -> Value:

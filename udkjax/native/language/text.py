@@ -5,7 +5,7 @@ from collections.abc import Collection, Iterable, Sequence
 
 from udkjax.native.language.ir import Function
 
-ALLOCATION = ("declare ptr @malloc(i64)", "declare void @free(ptr)")
+ALLOCATION_DECLARATIONS = ("declare ptr @malloc(i64)", "declare void @free(ptr)")
 # Intrinsics that LLVM writes as instructions for each target
 INSTRUCTIONS = frozenset(
     (

@@ -20,9 +20,9 @@ from udkjax.native.lowering.varying import parts_of, places_of_calls, states_of_
 # Operations of a branch, of the body of a loop or of a call that becomes a function of its own: equal ones are one function,
 # and LLVM takes more than in proportion to the length of a function. The instants of a box on two corners with friction take
 # 13 s in one function, 2.9 s in functions of more than 60 operations, 3.3 s in those of more than 200.
-APART = 60
-UNROLLED = 16  # loops over at most this many elements are unrolled
-LONGEST = 40  # an array whose elements take more operations is stored, so that the text of one loop stays short
+SEPARATE_FUNCTION_SIZE = 60
+UNROLLED_ELEMENTS = 16  # loops over at most this many elements are unrolled
+LONGEST_ELEMENT = 40  # an array whose elements take more operations is stored, so that the text of one loop stays short
 
 
 EquationRule = Callable[["Lowering", Any, list[Array]], list[Array]]
@@ -130,7 +130,7 @@ class Lowering:
         """Compute all elements of x, and store them in the array `to`."""
         self.each(x.shape, lambda index: to.write(self.f, index, x.read(self.f, index)))
 
-    def each(self, shape: Sequence[int], do: Callable[[Index], None], index: Index = (), most: int = UNROLLED):
+    def each(self, shape: Sequence[int], do: Callable[[Index], None], index: Index = (), most: int = UNROLLED_ELEMENTS):
         """Run the code of `do` for all indices of a shape, after `index`; loops over at most `most` indices are unrolled."""
         if not shape:
             do(index)
@@ -159,7 +159,7 @@ class Lowering:
         for equation in jaxpr.eqns:
             found = self._lower(self, equation, [value(a) for a in equation.invars])
             for variable, x in zip(equation.outvars, found, strict=True):
-                is_dear = (uses[variable] > 1 and x.cost > 0) or x.cost > LONGEST or not x.shape
+                is_dear = (uses[variable] > 1 and x.cost > 0) or x.cost > LONGEST_ELEMENT or not x.shape
                 values[variable] = self.stored(x) if is_dear and variable in uses else x
         return [value(a) for a in jaxpr.outvars]
 
@@ -229,7 +229,7 @@ class Lowering:
 
     def part(self, closed: Any, given: Sequence[Array]) -> list[Array]:
         """Lower a jaxpr with its constants, as a function of its own if it is long; return its outputs."""
-        return self._apart(closed, given) if operations(closed) > APART else self.closed(closed, given)
+        return self._apart(closed, given) if operations(closed) > SEPARATE_FUNCTION_SIZE else self.closed(closed, given)
 
     def _apart(self, closed: Any, given: Sequence[Array]) -> list[Array]:
         """Lower a jaxpr as a separate function, and call it; return the outputs. Functions with equal texts are one function."""

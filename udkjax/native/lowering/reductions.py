@@ -8,9 +8,9 @@ import numpy as np
 from udkjax.native.language.ir import BOOL, DOUBLE, INT, Operand, Value
 from udkjax.native.language.program import UnsupportedError
 from udkjax.native.lowering.arrays import Array, Index, Lazy, SingleNumber, fit, plus
-from udkjax.native.lowering.lowering import UNROLLED, Lowering
+from udkjax.native.lowering.lowering import UNROLLED_ELEMENTS, Lowering
 
-MOST, BLOCK = 12, 8  # results in registers at once: a short row, or a part of a longer one
+MOST_IN_REGISTERS, BLOCK_LENGTH = 12, 8  # results in registers at once: a short row, or a part of a longer one
 
 
 def _reduced(
@@ -36,7 +36,7 @@ def _reduced(
     f, lanes = to.f, to.f.width if x.varies else 1
 
     def block(indices: Sequence[Index]) -> list[Value]:
-        if len(indices) * int(np.prod(terms)) <= UNROLLED:
+        if len(indices) * int(np.prod(terms)) <= UNROLLED_ELEMENTS:
             found = [f.const(start, x.base, lanes) for _ in indices]
             for over in np.ndindex(*terms):
                 found = [join(total, fit(f, term(i, over), x.varies)) for total, i in zip(found, indices, strict=True)]
@@ -47,7 +47,7 @@ def _reduced(
             for total, i in zip(totals, indices, strict=True):
                 total.value = join(total.value, fit(f, term(i, over), x.varies))
 
-        to.each(terms, add, most=max(1, UNROLLED // len(indices)))
+        to.each(terms, add, most=max(1, UNROLLED_ELEMENTS // len(indices)))
         return [total.value for total in totals]
 
     if not shape:
@@ -60,11 +60,11 @@ def _reduced(
             whole.write(f, place, value)
 
     def row(index: Index):
-        if count <= MOST:
+        if count <= MOST_IN_REGISTERS:
             return blocks(index, 0, count)
-        with f.each(count // BLOCK) as k:
-            blocks(index, k * BLOCK, BLOCK)
-        return blocks(index, count - count % BLOCK, count % BLOCK)
+        with f.each(count // BLOCK_LENGTH) as k:
+            blocks(index, k * BLOCK_LENGTH, BLOCK_LENGTH)
+        return blocks(index, count - count % BLOCK_LENGTH, count % BLOCK_LENGTH)
 
     to.each(outer, row, most=1)
     return whole

@@ -60,8 +60,8 @@ def lower(to: Lowering, equation: Any, inputs: list[Array]) -> list[Array]:
         return to.part(inner, inputs)
     for v in equation.outvars:
         base_of(v.aval.dtype)
-    if name in CONTROL:
-        return CONTROL[name](to, equation, inputs)
+    if name in CONTROL_RULES:
+        return CONTROL_RULES[name](to, equation, inputs)
     out = equation.outvars[0].aval
     if name in ELEMENTWISE:
         return [_elementwise(to, name, inputs, p, out)]
@@ -186,7 +186,7 @@ def _tile(to: Lowering, equation: Any, inputs: list[Array]) -> list[Array]:
     return _plain(tiled, {"counts": equation.params["reps"]}, to, equation, inputs)
 
 
-CONTROL = {
+CONTROL_RULES = {
     "scan": _scan,
     "while": _while,
     "cond": _cond,

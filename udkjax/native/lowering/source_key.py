@@ -23,16 +23,20 @@ from jax.core import Tracer
 
 from udkjax.arrays import TreeMethod
 
-_KNOWN = frozenset("abc builtins collections equinox functools itertools jax jaxlib jaxtyping math numpy operator typing".split())
+_KNOWN_MODULES = frozenset(
+    "abc builtins collections equinox functools itertools jax jaxlib jaxtyping math numpy operator typing".split()
+)
 _FOLDERS = ("equations/laws", "native/language", "native/lowering", "native/parts", "native/pseudoinverses", "pinv")
 _PACKAGE = Path(__file__).parents[2]
 _FILES = ("integrate/stabilization.py",)  # with classes from which those of users are derived
 _PREFIXES = tuple(f"{_PACKAGE.name}.{x.removesuffix('.py').replace('/', '.')}" for x in (*_FOLDERS, *_FILES))
-_CHANGING = frozenset("fromfile fromregex genfromtxt load loadtxt memmap random".split())  # functions whose results may change
+# Functions whose results may change.
+_CHANGING_FUNCTIONS = frozenset("fromfile fromregex genfromtxt load loadtxt memmap random".split())
 _WITHOUT_KEY = frozenset("__import__ breakpoint compile eval exec globals hash id input locals open vars".split())
-_GENERATED = frozenset("__eq__ __hash__ __init__ __replace__ __repr__".split())  # by dataclasses; tracing does not use them
+# By dataclasses; tracing does not use them.
+_GENERATED_METHODS = frozenset("__eq__ __hash__ __init__ __replace__ __repr__".split())
 _Compiled = type(jax.jit(lambda: None))
-_PLAIN = (type(None), bool, int, float, complex, str, bytes, type(...))
+_PLAIN_TYPES = (type(None), bool, int, float, complex, str, bytes, type(...))
 
 
 def source_key(*objects: Any) -> str | None:
@@ -67,7 +71,7 @@ def _versions() -> tuple[Any, ...]:
 def _is_known(module: Any) -> bool:
     """Return True if keys contain the objects of a module of this name by their names only."""
     parts = str(module).split(".")
-    return "random" not in parts and (parts[0] in _KNOWN or str(module).startswith(_PREFIXES))
+    return "random" not in parts and (parts[0] in _KNOWN_MODULES or str(module).startswith(_PREFIXES))
 
 
 class _Source:
@@ -84,7 +88,7 @@ class _Source:
             self._add(x)
 
     def _add(self, x: Any):
-        if type(x) in _PLAIN:
+        if type(x) in _PLAIN_TYPES:
             self._note(type(x).__name__, x)
         elif id(x) in self._places:
             self._note("again", self._places[id(x)])
@@ -103,7 +107,7 @@ class _Source:
             case dict():
                 self._note("dict", len(x))
                 self.add_all(part for item in x.items() for part in item)
-            case frozenset() if all(type(part) in _PLAIN for part in x):
+            case frozenset() if all(type(part) in _PLAIN_TYPES for part in x):
                 self._note("frozenset", sorted(map(repr, x)))
             case FunctionType():
                 self._add_function(x)
@@ -128,7 +132,7 @@ class _Source:
         """Add a module or function of a known library by its name, or a compiled function of JAX by the one that it compiles."""
         module = x.__name__ if isinstance(x, ModuleType) else getattr(x, "__module__", None)
         name = getattr(x, "__name__", None)
-        if _is_known(module) and isinstance(name, str) and name not in _CHANGING:
+        if _is_known(module) and isinstance(name, str) and name not in _CHANGING_FUNCTIONS:
             self._note("named", type(x).__name__, module, name)
         elif type(x) is _Compiled:
             self._note("compiled")
@@ -143,13 +147,13 @@ class _Source:
         self.add_all(x.__bases__)
         for name, value in vars(x).items():
             is_special = name.startswith("__") and name.endswith("__")
-            if name != "_abc_impl" and not (is_special and (name in _GENERATED or not isinstance(value, FunctionType))):
+            if name != "_abc_impl" and not (is_special and (name in _GENERATED_METHODS or not isinstance(value, FunctionType))):
                 self._note("attribute", name)
                 self._add(value)
 
     def _add_function(self, x: FunctionType):
         if _is_known(x.__module__):
-            if x.__name__ in _CHANGING:
+            if x.__name__ in _CHANGING_FUNCTIONS:
                 raise _UnknownError
             return self._note("function", x.__module__, x.__qualname__)
         self._note("function")
@@ -178,7 +182,7 @@ class _Source:
         match operation:
             case "LOAD_GLOBAL" | "LOAD_NAME":
                 self._add_global(name, values)
-            case "LOAD_ATTR" | "LOAD_METHOD" | "IMPORT_FROM" if name in _CHANGING:
+            case "LOAD_ATTR" | "LOAD_METHOD" | "IMPORT_FROM" if name in _CHANGING_FUNCTIONS:
                 raise _UnknownError
             case "IMPORT_NAME" if not _is_known(name):
                 raise _UnknownError

@@ -9,9 +9,10 @@ from udkjax.native.language.program import PointerPlace
 from udkjax.native.module.layout import LANE_NUMBERS, Layout
 from udkjax.native.module.parts import AccelerationPart, FallbackPart, FrictionPart, ProjectionPart
 from udkjax.native.module.running import Running
-from udkjax.native.module.steps import POINTS
+from udkjax.native.module.steps import NODE_COUNT
 
-SPARE = 16  # places of constants are a multiple: the later module of a run (leaving.py), with a few more, has equal offsets
+# Places of constants are a multiple: the later module of a run (leaving.py), with a few more, has equal offsets.
+CONSTANTS_MULTIPLE = 16
 
 
 class RunArrays(Running):
@@ -39,7 +40,7 @@ class RunArrays(Running):
         p = self.places = Layout(plan.width, plan.vector)
         for name in (*LANE_NUMBERS, *plan.own_settings):
             p.add(name)
-        p.add("constants", -(-self.constants // SPARE) * SPARE)
+        p.add("constants", -(-self.constants // CONSTANTS_MULTIPLE) * CONSTANTS_MULTIPLE)
         p.add("state t")
         for name in (
             "state q",
@@ -56,12 +57,12 @@ class RunArrays(Running):
             "inverse unit",
         ):
             p.add(name, n)
-        for k in range(POINTS):
+        for k in range(NODE_COUNT):
             for x in "qva":
                 p.add(f"point{k} {x}", n)
         for i in range(1, self.stages):
             p.add(f"stage{i} a", n)
-        for k in range(3 * POINTS):
+        for k in range(3 * NODE_COUNT):
             p.add(f"difference{k}", n)
         p.add("rows", m)
         p.add("psi", m)

@@ -22,7 +22,7 @@ from typing import Any
 
 from udkjax.equations.programs.run_programs import RunPrograms
 from udkjax.native.language.ir import DOUBLE, Function, Value
-from udkjax.native.module.steps import POINTS
+from udkjax.native.module.steps import NODE_COUNT
 from udkjax.native.module.tableau import Method
 
 FORMULATION_SETTINGS = (
@@ -45,8 +45,9 @@ SETTINGS = (
 )
 INPUTS = ("numbers", "ts", "q", "v", "settings", "rows", "breaks")
 OUTPUTS = ("qs", "vs", "violation", "info")
-SHARE = 32  # minimum number of members of a thread: waking a thread takes 50 us, the shortest runs take 1 or 2 us each
-INFO = ("code", "t", "tried", "accepted", "evaluations", "written", "lost", "implicit")  # then the last q and v
+# Minimum number of members of a thread: waking a thread takes 50 us, the shortest runs take 1 or 2 us each.
+MEMBERS_PER_THREAD = 32
+INFO_NAMES = ("code", "t", "tried", "accepted", "evaluations", "written", "lost", "implicit")  # then the last q and v
 
 
 @dataclass(frozen=True)
@@ -104,7 +105,7 @@ LANE_NUMBERS = {  # numbers of each lane, and their meaning
     **dict.fromkeys(SETTINGS, "settings of the member"),
     "start": "first time (s)",
     "end": "last time (s)",
-    **{f"point{k}_t": "time of an accepted state (s); point3 is the latest" for k in range(POINTS)},
+    **{f"point{k}_t": "time of an accepted state (s); point3 is the latest" for k in range(NODE_COUNT)},
     "h": "step length chosen by the controller (s)",
     "t1": "end of the attempted step (s)",
     "step": "length of the attempted step (s); 0 at the beginning of a run",
@@ -129,7 +130,7 @@ LANE_NUMBERS = {  # numbers of each lane, and their meaning
     "fallback_due": "whether the next attempt must be made by the fallback",
     "retries": "number of successive attempts that were shortened because of a pivot",
     "distance": "distance from singular configurations: root of the smallest pivot relative to its diagonal entry",
-    **{f"distance{k}": "distance of the previous accepted states; distance2 is the latest" for k in range(POINTS - 1)},
+    **{f"distance{k}": "distance of the previous accepted states; distance2 is the latest" for k in range(NODE_COUNT - 1)},
     "farthest": "largest distance of an accepted state of a run that is not projected",
     "tolerance": "tolerance of the fastest velocity, in its unit",
     "rank": "rank of D found by the fallback",
@@ -146,7 +147,7 @@ LANE_NUMBERS = {  # numbers of each lane, and their meaning
     "patience": "attempts between two measurements of the rate",
     "trial": "length of the implicit step that is tried next, or now (s); 0: none",
     "unpaid": "consecutive implicit steps that do not pay",
-    **{f"point{k}_solved": "whether the step to an accepted state was implicit" for k in range(POINTS)},
+    **{f"point{k}_solved": "whether the step to an accepted state was implicit" for k in range(NODE_COUNT)},
     "implicit": "accepted implicit steps so far",
     "contraction": "rate of convergence of the stages of an implicit step",
     "size": "size of the last correction of a stage, relative to the tolerance",

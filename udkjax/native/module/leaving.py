@@ -12,10 +12,10 @@ from udkjax.native.language.ir import INT, POINTER, Function, Value
 from udkjax.native.module.layout import Lane
 from udkjax.native.module.memory import Memory
 
-LATER, LOAD = POINTERS = "later", "load_later"
+LATER_POINTER, LOAD_POINTER = POINTERS = "later", "load_later"
 RESUME = "resume"
 # Functions of which the two modules have different ones; they share the code of most others.
-DIFFERENT = frozenset(
+DIFFERENT_FUNCTIONS = frozenset(
     (
         *("prologue", "begin", "enter", "run", RESUME, "attempt", "decide", "approach"),
         *("differences", "tangent_differences", "step_back", "differences_back"),
@@ -34,7 +34,7 @@ def no_members(f: Function) -> Value:
 
 def go_on_if_loaded(f: Function):
     """If the later module is loaded, let it run all members, and return from `run(call)`."""
-    later = f.op(f"load atomic ptr, ptr @{LATER} acquire, align 8", POINTER)
+    later = f.op(f"load atomic ptr, ptr @{LATER_POINTER} acquire, align 8", POINTER)
     with f.if_(~f.is_null(later)):
         f.line(f"call void {later.name}(ptr {f.given['call'].name}, ptr {no_members(f).name})")
         f.leave()
@@ -42,7 +42,7 @@ def go_on_if_loaded(f: Function):
 
 def go_on(module: Memory, f: Function, members: Value):
     """Load the later module, and let it run `members` and all members that have not begun; report no memory if it fails."""
-    load = f.op(f"load ptr, ptr @{LOAD}, align 8", POINTER)
+    load = f.op(f"load ptr, ptr @{LOAD_POINTER}, align 8", POINTER)
     later = f.op(f"call ptr {load.name}()", POINTER)
     f.choose(
         f.is_null(later),

@@ -19,7 +19,7 @@ class Later:
 
     def __init__(self, library: machine.Library, load: Callable[[], "Code"]):
         self._load_code, self._lock = load, RLock()
-        self._pointer = ctypes.c_void_p.from_address(library[leaving.LATER])
+        self._pointer = ctypes.c_void_p.from_address(library[leaving.LATER_POINTER])
         self.code: Code | None = None  # None until it is loaded
 
     def load(self) -> int:
@@ -65,7 +65,7 @@ class Code:
             self.run.later = self.later = Later(library, load_later)
             self.run.load_later = ctypes.CFUNCTYPE(ctypes.c_void_p)(self.later.load)
             address = ctypes.cast(self.run.load_later, ctypes.c_void_p).value
-            ctypes.c_void_p.from_address(library[leaving.LOAD]).value = address
+            ctypes.c_void_p.from_address(library[leaving.LOAD_POINTER]).value = address
 
     def texts(self) -> list[str]:
         """Return the text of the module, and of the later module if runs may leave it."""
@@ -100,7 +100,7 @@ _REGISTERED: dict[str, Code] = {}
 _LOADING = Lock()
 
 
-def load(text: str, level: int = machine.LEVEL, load_later: Callable[[], Code] | None = None) -> Code:
+def load(text: str, level: int = machine.OPTIMIZATION_LEVEL, load_later: Callable[[], Code] | None = None) -> Code:
     """Return the loaded code of a module. All callers with the same text share optimized code while it is loaded.
 
     Args:
@@ -111,7 +111,7 @@ def load(text: str, level: int = machine.LEVEL, load_later: Callable[[], Code] |
     names = (
         "run",
         "call_frame",
-        *([interrupts.POINTER_NAME] if (is_interruptible := interrupts.GLOBAL in text) else ()),
+        *([interrupts.POINTER_NAME] if (is_interruptible := interrupts.POINTER_GLOBAL in text) else ()),
         *(leaving.POINTERS if load_later else [leaving.RESUME] if f"@{leaving.RESUME}(" in text else []),
     )
     name = f"udkjax_{machine.digest(text)}"

@@ -10,7 +10,7 @@ from udkjax.native.language.program import PointerPlace, consecutive, write
 from udkjax.native.module.arrays import RunArrays
 from udkjax.native.module.layout import Lane, Layout, Plan
 from udkjax.native.module.parts import StiffnessPart
-from udkjax.native.module.programs import COLD, DIFFERENTIATED, OUT, PROGRAMS
+from udkjax.native.module.programs import COLD_FUNCTIONS, DIFFERENTIATED_OUTPUTS, OUT_POINTER, PROGRAMS
 from udkjax.native.module.settling import friction_of
 from udkjax.native.module.steps import AIM_ACROSS
 
@@ -68,7 +68,7 @@ class Module(RunArrays):
 
     def _unroll(self, differentiated: Sequence[str], active: Sequence[bool]) -> Unrolled:
         asked = [program.outputs for program in self.programs.values()]
-        of = [DIFFERENTIATED[name] for name in differentiated]
+        of = [DIFFERENTIATED_OUTPUTS[name] for name in differentiated]
         return Unrolled(self.code, asked, of, active, self.mode, self.stiffness.method is not None)
 
     # --- programs
@@ -81,7 +81,7 @@ class Module(RunArrays):
 
     def write_programs(self):
         for name, program in self.programs.items():
-            stored = {x: (OUT, 0) if to == OUT else self.arrays[to] for x, to in program.stored.items()}
+            stored = {x: (OUT_POINTER, 0) if to == OUT_POINTER else self.arrays[to] for x, to in program.stored.items()}
             self.write_program(name, self.arrays | stored)
         self.write_prologue("prologue", self.unrolled)
         self.friction.write()
@@ -136,7 +136,7 @@ class Module(RunArrays):
                 pointers,
                 inputs,
                 outputs,
-                name in COLD and self.accelerations.has_cold_functions,
+                name in COLD_FUNCTIONS and self.accelerations.has_cold_functions,
                 lanes,
             )
         )
@@ -156,7 +156,7 @@ class Module(RunArrays):
 
     def new_function(self, name: str, arguments: Sequence[tuple[str, str]], width: int) -> Function:
         """Add a function of `width` lanes to the module; return it."""
-        f = Function(name, arguments, width, cold=name in COLD and self.accelerations.has_cold_functions)
+        f = Function(name, arguments, width, cold=name in COLD_FUNCTIONS and self.accelerations.has_cold_functions)
         self.functions.append(f)
         return f
 

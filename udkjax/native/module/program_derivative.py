@@ -21,11 +21,11 @@ from udkjax.expressions.loops.loop_program import LoopProgram, Reset
 from udkjax.native.language.program import PointerPlace
 from udkjax.native.module.layout import Layout
 from udkjax.native.module.module import Module
-from udkjax.native.module.programs import DIFFERENTIATED
+from udkjax.native.module.programs import DIFFERENTIATED_OUTPUTS
 
-SLOPES = "slopes"  # suffix of the functions of the slopes of the accelerations
+SLOPES_SUFFIX = "slopes"  # suffix of the functions of the slopes of the accelerations
 WAYS = ("d", "e", "de")  # derivatives along two directions and along both, one in each of three tangents
-GIVEN = ("d", "e")  # directions of numbers and of initial states, whose second derivatives are zero
+GIVEN_DIRECTIONS = ("d", "e")  # directions of numbers and of initial states, whose second derivatives are zero
 
 
 class ProgramDerivative:
@@ -39,21 +39,23 @@ class ProgramDerivative:
 
         Args:
             module: The module.
-            name: The program, of `DIFFERENTIATED`.
+            name: The program, of `DIFFERENTIATED_OUTPUTS`.
             evaluation: The name of the function that evaluates it, without its suffix.
             slopes: The layout of the tangent, for the derivatives by the state alone; None: the mode and layout of the module.
         """
-        self._module, self._name = module, name if slopes is None else SLOPES
+        self._module, self._name = module, name if slopes is None else SLOPES_SUFFIX
         self._suffix = "" if self._name == "accelerations" else f"_{self._name}"
         self._evaluation = evaluation + self._suffix
         self._mode, self._tangent = (module.mode, None) if slopes is None else (FORWARD, slopes)
         code = module.code if slopes is None else module.code.for_derivatives
-        self._evaluated: DifferentiableProgram = code.differentiable.of(*DIFFERENTIATED[name])
+        self._evaluated: DifferentiableProgram = code.differentiable.of(*DIFFERENTIATED_OUTPUTS[name])
         self._fixed = [] if module.moving and slopes is None else ["constants"]
         self._stored: dict[str, int] = {}  # offsets of the arrays of loops
         self.stored = 0
         if module.unrolled:
-            self._unrolled = module.unrolled.derivative(*DIFFERENTIATED[name]) if slopes is None else module.unrolled.slopes
+            self._unrolled = (
+                module.unrolled.derivative(*DIFFERENTIATED_OUTPUTS[name]) if slopes is None else module.unrolled.slopes
+            )
             self.stored = sum(x == "stored" for x, _ in self._unrolled.evaluation.outputs)
             return
         parts = self._evaluated.second_parts if self._mode == TWICE else self._evaluated.parts

@@ -11,23 +11,23 @@ class CalledProgram(NamedTuple):
     stored: Mapping[str, str] = {}
 
 
-FURTHER = "accelerations_further"
-OUT = "out"  # the pointer
-_STEP = "v1", "a at v1", "safe", "unsettled"
+FURTHER_ACCELERATIONS = "accelerations_further"
+OUT_POINTER = "out"  # the pointer
+_STEP_OUTPUTS = "v1", "a at v1", "safe", "unsettled"
 _TANGENT_PART = "dq1", "dv1", "distance"
-_ACCELERATIONS = "a", "safe", "unsettled"
-_TO_OUT, _AS_PSI = {"a": OUT}, {"psi_dot": "psi"}
+_ACCELERATION_OUTPUTS = "a", "safe", "unsettled"
+_TO_OUT, _AS_PSI = {"a": OUT_POINTER}, {"psi_dot": "psi"}
 PROGRAMS = {
     # by elimination
-    "accelerations": CalledProgram(_ACCELERATIONS, _TO_OUT),
-    "accelerations_and_drift": CalledProgram((*_ACCELERATIONS, "psi", "distance"), _TO_OUT),
-    FURTHER: CalledProgram(("a further", "unsettled"), _TO_OUT),
+    "accelerations": CalledProgram(_ACCELERATION_OUTPUTS, _TO_OUT),
+    "accelerations_and_drift": CalledProgram((*_ACCELERATION_OUTPUTS, "psi", "distance"), _TO_OUT),
+    FURTHER_ACCELERATIONS: CalledProgram(("a further", "unsettled"), _TO_OUT),
     "newton_q": CalledProgram(("q1", "safe")),
     "newton_v_and_psi": CalledProgram(("v1", "psi")),
     "project": CalledProgram(("q1", "v1 at q1", "psi at q1")),
-    "project_and_accelerate": CalledProgram(_STEP),
+    "project_and_accelerate": CalledProgram(_STEP_OUTPUTS),
     "tangent_part": CalledProgram(_TANGENT_PART),
-    "end_of_step": CalledProgram((*_STEP, *_TANGENT_PART)),
+    "end_of_step": CalledProgram((*_STEP_OUTPUTS, *_TANGENT_PART)),
     "drift": CalledProgram(("distance", "psi")),
     "multipliers_of_settled": CalledProgram(("a settled", "safe", "multipliers")),
     "independent_rows": CalledProgram(("independent",)),
@@ -48,10 +48,10 @@ PROGRAMS = {
     "drift_of_rates": CalledProgram(("drift",)),
     "mobility": CalledProgram(("dv1 without rows",)),
 }
-DIFFERENTIATED = {"accelerations": ("a",), "projection": ("q1", "v1 at q1"), "newton_q": ("q1",), "newton_v": ("v1",)}
+DIFFERENTIATED_OUTPUTS = {"accelerations": ("a",), "projection": ("q1", "v1 at q1"), "newton_q": ("q1",), "newton_v": ("v1",)}
 
 # Rarely called functions: once per run, near singular configurations, where a piece may end, or once in an implicit step.
-COLD = (
+COLD_FUNCTIONS = (
     "end_piece",
     "along_motion",
     "jump",
@@ -67,7 +67,7 @@ COLD = (
     "newton_v_and_psi",
     "evaluation_slopes",
     "measure_speed",
-    FURTHER,
+    FURTHER_ACCELERATIONS,
     "settle_state",
     "settle_end",
 )

@@ -13,20 +13,20 @@ from udkjax.expressions.loops.loop_derivative import COTANGENT, FORWARD, PREFIXE
 from udkjax.expressions.loops.loop_program import LoopProgram, Reset
 from udkjax.native.module.module import Module
 
-PROLOGUE = {mode: f"prologue_{mode}" for mode in (FORWARD, REVERSE, TWICE)}
+PROLOGUE_NAMES = {mode: f"prologue_{mode}" for mode in (FORWARD, REVERSE, TWICE)}
 
 
 def write_prologue_derivative(module: Module, active: Sequence[bool], mode: str):
-    """Write the function `PROLOGUE[mode]`, the derivative of the prologue with respect to the active numbers."""
+    """Write the function `PROLOGUE_NAMES[mode]`, the derivative of the prologue with respect to the active numbers."""
     changes = ("constants", "numbers") if mode == REVERSE else ("numbers", "constants")
     pointers = ("numbers", "constants", *(prefix + x for x in changes for prefix in PREFIXES[mode]))
     at = {x: (x, 0) for x in pointers}
     if module.unrolled:
-        module.write_scalars(module.unrolled.prologue_derivative(active, mode), PROLOGUE[mode], pointers, at, 1)
+        module.write_scalars(module.unrolled.prologue_derivative(active, mode), PROLOGUE_NAMES[mode], pointers, at, 1)
         return
     derivative = LoopDerivative(module.code.prologue.parts, ())
     if mode == REVERSE:
         parts = [Reset(f"{COTANGENT}numbers", 0, module.code.number_count), *derivative.reverse.parts]
     else:
         parts = (derivative.forward if mode == FORWARD else derivative.second(())).parts
-    module.loops.write(LoopProgram(parts), PROLOGUE[mode], pointers, at, width=1)
+    module.loops.write(LoopProgram(parts), PROLOGUE_NAMES[mode], pointers, at, width=1)

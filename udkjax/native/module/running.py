@@ -6,7 +6,7 @@ from collections.abc import Callable
 from udkjax.native.code import interrupts
 from udkjax.native.language.ir import BOOL, DOUBLE, INT, POINTER, Function, Value
 from udkjax.native.language.loops import LoopWriter
-from udkjax.native.language.text import ALLOCATION, text_of_module
+from udkjax.native.language.text import ALLOCATION_DECLARATIONS, text_of_module
 from udkjax.native.module.layout import Lane
 from udkjax.native.module.memory import Memory, ThreadCode
 from udkjax.native.module.parts import StiffnessPart
@@ -36,8 +36,8 @@ class Running(Memory):
         """Write all functions; return LLVM's text of the whole module."""
         self.write_functions()
         self._write_run()
-        pointers = [*self.stiffness.pointers, *([interrupts.GLOBAL] if self._has_signals else [])]
-        text = text_of_module([*self.functions, *self.loops.functions], [*self.loops.globals, *pointers], ALLOCATION)
+        pointers = [*self.stiffness.pointers, *([interrupts.POINTER_GLOBAL] if self._has_signals else [])]
+        text = text_of_module([*self.functions, *self.loops.functions], [*self.loops.globals, *pointers], ALLOCATION_DECLARATIONS)
         return self.stiffness.mark(text)
 
     def thread_code(self) -> ThreadCode:

@@ -1,10 +1,11 @@
 """Further rounds of Newton's method for friction that depends on the loads of joints.
 
-The programs `SETTLING` take one round. They set `unsettled` to zero if that suffices, otherwise to the sum of one if the loads
-are no solution and of two if pivots are negative. The solution of their linear system is `settled`. Two functions then take the
-further rounds that unsettled lanes need; other lanes do not change. Lanes that still do not settle, or whose pivots are negative,
-begin again with the solution without friction, and follow it as friction grows: to all of it at once, in `RunPrograms.STAGES`
-stages, or in shorter stages where one of these fails. At the end of such a stage, a solution with negative pivots is accepted:
+The programs `SETTLING_PROGRAMS` take one round. They set `unsettled` to zero if that suffices, otherwise to the sum of one if the
+loads are no solution and of two if pivots are negative. The solution of their linear system is `settled`. Two functions then take
+the further rounds that unsettled lanes need; other lanes do not change. Lanes that still do not settle, or whose pivots are
+negative, begin again with the solution without friction, and follow it as friction grows: to all of it at once, in
+`RunPrograms.STAGES` stages, or in shorter stages where one of these fails. At the end of such a stage, a solution with negative
+pivots is accepted:
 
     settle_state(work, out)    at `state v`; the accelerations are at `out`
     settle_end(work, out)      the same at `result v`, the velocities at the end of a step
@@ -17,19 +18,19 @@ from udkjax.native.language.ir import DOUBLE, INT, POINTER, Function, Value
 from udkjax.native.module.layout import Lane
 from udkjax.native.module.memory import Memory
 from udkjax.native.module.parts import FrictionPart
-from udkjax.native.module.programs import FURTHER
+from udkjax.native.module.programs import FURTHER_ACCELERATIONS
 from udkjax.native.module.steps import SETTLING_ROUNDS, STAGE_ROUNDS
 
 AT_STATE = ("accelerations", "accelerations_and_drift")
 AT_END = ("project_and_accelerate", "end_of_step")
-SETTLING = (*AT_STATE, *AT_END)
+SETTLING_PROGRAMS = (*AT_STATE, *AT_END)
 
 
 class LoadFriction(FrictionPart):
     """Friction that depends on the loads of joints, found by further rounds of Newton's method."""
 
     settles = True
-    programs = (FURTHER,)
+    programs = (FURTHER_ACCELERATIONS,)
     shared = ("velocities",)
     arrays = RunPrograms.BEGINS
 
@@ -52,7 +53,7 @@ class LoadFriction(FrictionPart):
             write_settle_end(module, module.function("settle_end", arguments)[0])
 
     def settle_after(self, f: Function, name: str, out: str | None):
-        if name in SETTLING:
+        if name in SETTLING_PROGRAMS:
             with f.if_(f.any_of(Lane(f, self._in.places).unsettled > 0.5)):
                 address = self._in.address(f, out or "result a")
                 f.call("settle_end" if name in AT_END else "settle_state", f.given["work"], address)
@@ -63,7 +64,7 @@ class LoadFriction(FrictionPart):
 
 def friction_of(module: Memory, names: Sequence[str]) -> FrictionPart:
     """Return the part of a module for friction by loads; `names` are the programs of the module."""
-    needs = module.plan.code.rubs and any(name in SETTLING for name in names)
+    needs = module.plan.code.rubs and any(name in SETTLING_PROGRAMS for name in names)
     return LoadFriction(module, any(name in AT_END for name in names)) if needs else FrictionPart()
 
 
@@ -117,7 +118,7 @@ def _write_rounds(module: Memory, f: Function, s: Lane, most: int, goes_on: Call
         open_ = goes_on(before)
         if f.width > 1:  # a single lane is open here
             _keep(module, f, "settled", "settled before", open_ | ~open_)
-        module.invoke(f, FURTHER, "further a")
+        module.invoke(f, FURTHER_ACCELERATIONS, "further a")
         module.copy(f, "further a", "out", open_)
         if f.width > 1:  # other lanes keep theirs: what follows from it must not depend on the lanes beside
             _keep(module, f, "settled before", "settled", ~open_)

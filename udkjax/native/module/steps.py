@@ -24,22 +24,22 @@ FACTORS = StepFactors()
 RESTART_FACTOR = 0.5
 
 # Steps near singular configurations. The distance is the root of the smallest pivot of D D^T relative to its diagonal entry.
-RETRIES = 3  # attempts to avoid a pivot that is too small for elimination, before the fallback takes the step
+PIVOT_RETRIES = 3  # attempts to avoid a pivot that is too small for elimination, before the fallback takes the step
 # Smallest distance at the stages of a step: elimination is not used below 1e-3 (`BRANCH_TOL`).
 NEAREST_STAGE = 1.5e-3
 # Distance beyond which no step is planned around a singular configuration: rows that meet at a larger angle are well conditioned.
-NEAR = 0.1
+PLANNING_DISTANCE = 0.1
 # The rounding error of accelerations, in the scene's own units, is this number divided by the cube of the distance. Its
 # contribution to the velocity in a step must be less than the tolerance.
 ROUNDING_GROWTH = 3e-14
 # The rounding error of a velocity across, in the same units, is this number divided by the square of the distance: a few eps. A
 # larger one lets errors of the method pass: with 1e-14, an overconstrained chain in space loses 15,000 tolerances of its energy.
 ROUNDING_ACROSS = 1e-15
-# SURE: fraction of a step. If a singular configuration is predicted before this fraction, the step certainly passes it:
+# If a singular configuration is predicted before the fraction SURE_FRACTION of a step, the step certainly passes it:
 # predictions are too early by at most a tenth of a step. From far away they may be too early by three tenths, and the
-# configuration may still be ahead; then the distance at the end of the step is less than EXPECTED times the extrapolated
+# configuration may still be ahead; then the distance at the end of the step is less than EXPECTED_RATIO times the extrapolated
 # distance.
-SURE, EXPECTED = 0.85, 0.3
+SURE_FRACTION, EXPECTED_RATIO = 0.85, 0.3
 
 # Further rounds of Newton's method for the loads of joints with friction. Five are needed at 0.99 of the jamming coefficients.
 SETTLING_ROUNDS = 20
@@ -48,52 +48,57 @@ STAGE_ROUNDS = 8  # in a stage of growing friction, which is repeated with less 
 # Breakpoints: a step ends two units of rounding before the time of a breakpoint, and the next begins one unit after it.
 # Breakpoints closer to one another than the smallest step count as one.
 SMALLEST_STEP = 100.0  # in units of rounding of the end time; time would not advance by shorter steps
-UNIT = 1 / SMALLEST_STEP  # a unit of rounding, as a fraction of the smallest step
-ENDS_BEFORE, BEGINS_BEHIND = 2 * UNIT, UNIT
-GAP = ENDS_BEFORE + BEGINS_BEHIND
+ROUNDING_UNIT = 1 / SMALLEST_STEP  # a unit of rounding, as a fraction of the smallest step
+ENDS_BEFORE, BEGINS_BEHIND = 2 * ROUNDING_UNIT, ROUNDING_UNIT
+BREAK_GAP = ENDS_BEFORE + BEGINS_BEHIND
 
 # Pieces of the state.
-EDGE = 1e-7  # length of the step across the end of a piece, as a fraction of a step; its error is of the order of its square
+EDGE_STEP = 1e-7  # length of the step across the end of a piece, as a fraction of a step; its error is of the order of its square
 # Fraction of a step. An end of a piece closer than this to an end of the step is located exactly, from the state at that end.
-NEAR_END = 0.01
+NEAR_END_FRACTION = 0.01
 # A repeated step ends slightly beyond the end of a piece. Once the end of the piece has been located, a step ends just before it,
 # and the next step crosses it.
 AIM_BEYOND, AIM_BEFORE, AIM_ACROSS = range(3)
 # A step crosses the end of a piece of an element, or a state where the load of a joint with friction changes its sign.
 ACROSS_PIECE, ACROSS_EDGE = 1.0, 2.0
-HALVINGS = 40  # at most; they locate the end of a piece within a step
+PIECE_HALVINGS = 40  # at most; they locate the end of a piece within a step
 # Share of the tolerance of velocities. A load that would change them less in a step may be a rounding error of random sign: the
 # slide has no load.
-NO_LOAD = 0.01
+NEGLIGIBLE_LOAD = 0.01
 # Share of the load of an edge at the start of a step. If it is smaller at the end, stages near the end may be beyond its zero.
-NEAR_ZERO = 0.2
-TRIES = 8  # successive attempts to end a step at the end of a piece; for a state at rest there, rounding decides between pieces
+NEAR_ZERO_SHARE = 0.2
+# Successive attempts to end a step at the end of a piece; for a state at rest there, rounding decides between pieces.
+PIECE_TRIES = 8
 
 # Stages of implicit methods. A correction below STAGE_TOL of the tolerance of a step is the last. The rate of convergence, the
-# ratio of a correction to the one before, counts for later stages, FADING with each correction. Where it exceeds SLOW, the matrix
-# is renewed, at most RENEWALS times in a stage, and for EAGER steps at the beginning of each stage. If the rate exceeds DIVERGING
-# nevertheless, or a correction is too large after STAGE_ITERATIONS, the step is repeated with STAGE_SHRINK of its length.
-STAGE_TOL, STAGE_ITERATIONS, FADING, SLOW, RENEWALS, EAGER, DIVERGING, STAGE_SHRINK = 1e-3, 10, 0.3, 0.3, 3.0, 10.0, 1.0, 0.4
+# ratio of a correction to the one before, also counts for later stages; it fades by the factor RATE_FADING with each correction.
+STAGE_TOL, RATE_FADING = 1e-3, 0.3
+# Where the rate exceeds SLOW_RATE, the matrix is renewed: at most RENEWALS times in a stage, and during the next EAGER_STEPS
+# steps at the beginning of each stage. If the rate exceeds DIVERGING_RATE nevertheless, or a correction is too large after
+# STAGE_ITERATIONS, the step is repeated with STAGE_SHRINK of its length.
+SLOW_RATE, RENEWALS, EAGER_STEPS, DIVERGING_RATE, STAGE_ITERATIONS, STAGE_SHRINK = 0.3, 3.0, 10.0, 1.0, 10, 0.4
 
-# Change to an implicit method. The largest rate of the equations is measured in one of PATIENCE attempts: in all, it would take a
-# tenth of the time of small scenes. Where the length of an explicit step times this rate exceeds LIMIT, stability may limit it:
-# Dopri8 is stable up to 3.7 for undamped oscillations, and up to STABLE for others, and the controller takes four fifths of that:
-# both are properties of its tableau, and ten times as much would never be reached.
+# Change to an implicit method. The largest rate of the equations is measured in one of MEASURING_PERIOD attempts: measured in
+# each, it would take a tenth of the time of small scenes. Where the length of an explicit step times this rate exceeds
+# STIFF_LIMIT, stability may limit it: Dopri8 is stable up to 3.7 for undamped oscillations, and up to STABILITY_LIMIT for others,
+# and the controller takes four fifths of that. Both are properties of its tableau, and ten times as much would never be reached.
 # But steps as long may be due to a visible vibration, which every method must follow. Therefore the next attempt is an implicit
-# step that is CLEARLY longer than one has to be to pay. If its error is below the tolerance, the run goes on implicitly, until
-# UNPAID steps in succession do not pay. After each failure of either kind the run waits twice as many attempts until the next
-# measurement.
-LIMIT, STABLE, PATIENCE, CLEARLY, UNPAID = 3.0, 5.2, 32.0, 2.0, 25.0
-# The cost of an implicit step in evaluations of accelerations: CORRECTIONS for each of its stages, and the slopes along n
-# directions, each of which takes as long as SLOPE evaluations, or SLOPE_IN_LANES where some directions share a register.
-CORRECTIONS, SLOPE, SLOPE_IN_LANES = 3.0, 2.0, 0.5
+# step, PAYING_MARGIN times as long as it has to be to pay. If its error is below the tolerance, the run goes on implicitly, until
+# UNPAID_STEPS steps in succession do not pay. After each failure of either kind the run waits twice as many attempts until the
+# next measurement.
+STIFF_LIMIT, STABILITY_LIMIT, MEASURING_PERIOD, PAYING_MARGIN, UNPAID_STEPS = 3.0, 5.2, 32.0, 2.0, 25.0
+# The cost of an implicit step in evaluations of accelerations: CORRECTION_COST for the corrections of each stage, and SLOPE_COST
+# for the slopes along each of n directions, or SLOPE_COST_IN_LANES where several directions share a register.
+CORRECTION_COST, SLOPE_COST, SLOPE_COST_IN_LANES = 3.0, 2.0, 0.5
 
-POINTS = 4  # states that the interpolating polynomial passes through; with three, velocities between steps are less accurate
+# States that the interpolating polynomial passes through; with three, velocities between steps are less accurate.
+NODE_COUNT = 4
 # Fraction of a step. If less than this would remain for the last step, the remaining time is halved instead. Outputs of the
 # first step are interpolated after the second, and interpolation through two close points amplifies rounding errors: to 1e-4 m/s
 # if the last step is 1/300 of the step before it.
 SHORTEST_LAST = 0.25
-STRETCH = 12.0  # largest ratio of the last step to those before, and of a step to the next attempt: steps grow at most tenfold
+# Largest ratio of the last step to those before, and of a step to the next attempt: steps grow at most tenfold.
+LARGEST_STRETCH = 12.0
 # Length of a step, in T, below which the change of a position follows from velocities and accelerations at its ends: the error is
 # of the fifth order, while the rounding errors of the positions would add as many units of rounding to a velocity, divided by it.
 SHORT_STEP = 1e-6

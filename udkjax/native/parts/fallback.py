@@ -19,7 +19,7 @@ from udkjax.native.module.steps import FACTORS, NEAREST_STAGE, OPEN_OUTPUT, OUTP
 from udkjax.native.parts.manifold import iterate_newton, largest_violation, with_threshold
 from udkjax.native.parts.singular import limit_of_error, retry_or_fall_back, step_across, step_around, time_to_singularity
 
-RESULTS = ("a", "q", "v", "dq", "dv")  # of the fallback
+FALLBACK_RESULTS = ("a", "q", "v", "dq", "dv")  # of the fallback
 
 
 class RankRevealing(FallbackPart):
@@ -32,7 +32,7 @@ class RankRevealing(FallbackPart):
         self._in = module
 
     def reserve(self):
-        for name in RESULTS:
+        for name in FALLBACK_RESULTS:
             self._in.places.add(f"fallback {name}", self._in.n)
 
     @abstractmethod

@@ -23,7 +23,7 @@ from udkjax.native.pseudoinverses.qr import apply_q, pivoted_qr, qr_matrices
 from udkjax.native.pseudoinverses.svd import SVDCode
 from udkjax.native.pseudoinverses.weighted_rows import RowEntries
 
-TOL, MASS = FORMULATION_SETTINGS
+TOL_SETTING, MASS_SETTING = FORMULATION_SETTINGS
 FORMULATE = "formulate"
 
 
@@ -133,7 +133,7 @@ class ScaledAccelerations(FormulatedAccelerations):
     def mass(self, f: Function, i: Operand) -> Value:
         """Return entry i of the diagonal of M, in the scene's own units."""
         share = self._unit(f, i) / (self._array(f, "root", i) * self._array(f, "length"))
-        return share * share / self._array(f, MASS)
+        return share * share / self._array(f, MASS_SETTING)
 
     def each_entry(self, f: Function) -> Iterator[tuple[Value, Value, Value]]:
         """Run the block for each entry of A: its row, its column and its value."""
@@ -161,7 +161,7 @@ class AugmentedAccelerations(ScaledAccelerations):
 
     def __init__(self, module: Module, method: DenseMethod):
         size, self._method = module.n + module.m, method
-        super().__init__(module, DenseLayout(module, method.matrices(size, size), (size, size), "augmented", TOL))
+        super().__init__(module, DenseLayout(module, method.matrices(size, size), (size, size), "augmented", TOL_SETTING))
 
     def solve(self, d: DenseMatrices) -> MatrixRow:
         f, n, b = d.f, self._in.n, d.row("b")
@@ -199,7 +199,7 @@ class NullSpaceAccelerations(ScaledAccelerations):
     def __init__(self, module: Module, columns: int):
         n = module.n
         extra = {"basis": (n, n), "weighted": (n, n), "mass": (1, n)}
-        super().__init__(module, DenseLayout(module, qr_matrices(n, columns) | extra, (n, columns), "null space", TOL))
+        super().__init__(module, DenseLayout(module, qr_matrices(n, columns) | extra, (n, columns), "null space", TOL_SETTING))
 
     @abstractmethod
     def solve_rows(self, d: DenseMatrices):
@@ -276,7 +276,7 @@ class NullSpaceSVDAccelerations(NullSpaceAccelerations):
         m, n = module.m, module.n
         super().__init__(module, min(m, n))
         self._method = SVDCode(relative=True)
-        self._rows = DenseLayout(module, self._method.matrices(m, n), (m, n), "null space rows", TOL)
+        self._rows = DenseLayout(module, self._method.matrices(m, n), (m, n), "null space rows", TOL_SETTING)
 
     def solve_rows(self, d: DenseMatrices):
         f, svd = d.f, DenseMatrices(self._rows, d.f)

@@ -9,10 +9,10 @@ import jax.numpy as jnp
 from udkjax.native.code import processor
 from udkjax.native.lowering.own_objects import Input, OwnObject, Written, named, written
 from udkjax.native.module.module import Module
-from udkjax.native.parts.formulations import MASS, FormulatedAccelerations, FormulationCode, ScaledAccelerations
+from udkjax.native.parts.formulations import MASS_SETTING, FormulatedAccelerations, FormulationCode, ScaledAccelerations
 from udkjax.native.pseudoinverses.dense import DenseLayout, DenseMatrices, MatrixRow
 
-_TRIAL = (2, 3)  # the numbers of rows and coordinates by which the operations of a formulation are looked at
+_TRIAL_SHAPE = (2, 3)  # the numbers of rows and coordinates by which the operations of a formulation are looked at
 
 
 @dataclass(frozen=True)
@@ -32,12 +32,12 @@ class OwnFormulationCode(FormulationCode):
         """
         with named("formulation", formulation):
             code = cls(OwnObject.of(formulation))
-            code.written(*_TRIAL)
+            code.written(*_TRIAL_SHAPE)
         return code
 
     @property
     def settings(self) -> tuple[str, ...]:
-        return (MASS, *number_names(sum(self.own.sizes)))
+        return (MASS_SETTING, *number_names(sum(self.own.sizes)))
 
     def prepare(self, module: Module) -> FormulatedAccelerations:
         return OwnAccelerations(module, self)

@@ -31,8 +31,8 @@ from udkjax.native.module.parts import AccelerationPart
 from udkjax.native.pseudoinverses.householder import HouseholderCode
 from udkjax.native.pseudoinverses.weighted_rows import WeightedRows
 
-TOL = "stabilization_tol"
-STATE = "at_t", "at_q", "at_v"  # the places of the state of a call
+TOL_SETTING = "stabilization_tol"
+STATE_PLACES = "at_t", "at_q", "at_v"  # the places of the state of a call
 
 
 class ModuleEquations(eqx.Module):
@@ -58,7 +58,7 @@ class ModuleEquations(eqx.Module):
         return jnp.diag(self._found("mass", "at_x", self.n, t, q, v))
 
     def _found(self, function: str, place: str, count: int, *state: Any) -> Array:
-        return ModuleCall((f"stabilization_{function}",), STATE, ((place, (count,)),))(*state)[0]
+        return ModuleCall((f"stabilization_{function}",), STATE_PLACES, ((place, (count,)),))(*state)[0]
 
     def least_change(self, t: Any, q: Any, v: Any, residual: Any, count: int) -> Array:
         if jnp.shape(residual) != (count,):
@@ -67,7 +67,7 @@ class ModuleEquations(eqx.Module):
             return jnp.zeros(self.n)
         given = jnp.concatenate([jnp.asarray(residual, float), jnp.zeros(self.rows - count)])
         factor = "stabilization_factor" + ("_positions" if count < self.rows else "")
-        call = ModuleCall((factor, "stabilization_solve"), (*STATE, "at_b"), (("at_x", (self.n,)),), len(STATE))
+        call = ModuleCall((factor, "stabilization_solve"), (*STATE_PLACES, "at_b"), (("at_x", (self.n,)),), len(STATE_PLACES))
         return call(t, q, v, given)[0]
 
 
@@ -143,12 +143,12 @@ class StabilizationCode:
     @property
     def settings(self) -> tuple[str, ...]:
         """The names of all settings of the stabilization: the threshold of the rank of rows, then its numbers."""
-        return (TOL, *self.numbers)
+        return (TOL_SETTING, *self.numbers)
 
     def settings_of(self, stabilization: Any, tol: Any) -> dict[str, Any]:
         """Return the settings by name: `tol`, the threshold of the rank of rows, and the numbers of a stabilization."""
         numbers = [number for x in numbers_of(stabilization) for number in x.reshape(-1)]
-        return {TOL: tol, **dict(zip(self.numbers, numbers, strict=True))}
+        return {TOL_SETTING: tol, **dict(zip(self.numbers, numbers, strict=True))}
 
 
 class OwnStabilization:
@@ -180,7 +180,7 @@ class OwnStabilization:
             module.places.add("stabilization scratch", max(x.size for x in self._written))
         self._rows = None
         if self._calls("solve"):
-            self._rows = WeightedRows(module, HouseholderCode(relative=True), prefix="least_change", tol=TOL)
+            self._rows = WeightedRows(module, HouseholderCode(relative=True), prefix="least_change", tol=TOL_SETTING)
 
     # --- functions
 

@@ -4,15 +4,15 @@ from udkjax.native.language.ir import DOUBLE, Function, Value
 from udkjax.native.module.layout import Lane
 from udkjax.native.module.parts import Shortened
 from udkjax.native.module.steps import (
-    EXPECTED,
+    EXPECTED_RATIO,
     FACTORS,
-    NEAR,
     NEAREST_STAGE,
-    RETRIES,
+    PIVOT_RETRIES,
+    PLANNING_DISTANCE,
     ROUNDING_ACROSS,
     ROUNDING_GROWTH,
     SHORTEST_LAST,
-    SURE,
+    SURE_FRACTION,
 )
 from udkjax.native.module.tableau import Method
 
@@ -32,10 +32,12 @@ def retry_or_fall_back(f: Function, s: Lane, failed: Value, tries: Value | None)
     is_near = stepping & ~fallback & (error < 1.0) & ~is_clear(f, s, s.distance) & (s.last < 0.5)
     time_left = time_to_singularity(s)
     has_passed = (
-        (time_left > 0.0) & (time_left < s.h * SURE) & (s.distance * time_left > s.distance2 * EXPECTED * (s.h - time_left))
+        (time_left > 0.0)
+        & (time_left < s.h * SURE_FRACTION)
+        & (s.distance * time_left > s.distance2 * EXPECTED_RATIO * (s.h - time_left))
     )
     is_near = is_near & ~(has_passed & (s.distance > NEAREST_STAGE))
-    shortens = (fallback_due | is_near) & was_clear & (s.retries < float(RETRIES)) & (s.begin < 0.5)
+    shortens = (fallback_due | is_near) & was_clear & (s.retries < float(PIVOT_RETRIES)) & (s.begin < 0.5)
     retries = where(shortens, s.retries + 1.0, where(error < 1.0, 0.0, s.retries))
     s.where(stepping if tries is None else stepping & ~tries, retries=retries)
     fallback_due = fallback_due & ~shortens
@@ -107,7 +109,7 @@ def step_around(f: Function, s: Lane, method: Method, distance: Value, time_left
     high = float(method.clearings[1])
     share, reach = time_left / h, high * FACTORS.safety  # the step after an approach may turn out shorter than h
     nearest = distance * (h * method.clearance / time_left)
-    is_ahead = (time_left > 0.0) & (share < 1.0 + reach) & (distance < NEAR) & ~is_clear(f, s, nearest, h)
+    is_ahead = (time_left > 0.0) & (share < 1.0 + reach) & (distance < PLANNING_DISTANCE) & ~is_clear(f, s, nearest, h)
     across = step_across(f, method, time_left, h)
     approach = time_left - h * reach
     approach = f.select(approach < h * SHORTEST_LAST, time_left * (1.0 / (1.0 + 2.0 * reach)), approach)

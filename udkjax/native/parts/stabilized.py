@@ -11,12 +11,12 @@ rate of the positions.
 from udkjax.native.language.ir import DOUBLE, Function, Value, Variable
 from udkjax.native.module.layout import Lane
 from udkjax.native.module.module import Module
-from udkjax.native.module.steps import POINTS
+from udkjax.native.module.steps import NODE_COUNT
 from udkjax.native.parts.elimination import EliminatedAccelerations
 from udkjax.native.parts.own_stabilization import OwnStabilization, StabilizationCode
 from udkjax.native.parts.projection import Unprojected, estimate_errors
 
-_LAST = f"point{POINTS - 1}"
+_LAST_POINT = f"point{NODE_COUNT - 1}"
 
 
 class Stabilized(Unprojected):
@@ -39,7 +39,7 @@ class Stabilized(Unprojected):
         if self.slips:
             module.stage_slips = [f"stage{i} slip" for i in range(module.stages)]
             names += [*module.stage_slips, "end slip", "end slipped"]
-            names += [f"point{k} {x}" for k in range(POINTS) for x in ("slip", "slipped")]
+            names += [f"point{k} {x}" for k in range(NODE_COUNT) for x in ("slip", "slipped")]
         for name in names:
             module.places.add(name, module.n)
 
@@ -52,10 +52,10 @@ class Stabilized(Unprojected):
             return
         module = self._in
         begins = self._lanes(f, s.begin > 0.5)
-        setattr(s, "state t", getattr(s, f"{_LAST}_t"))
+        setattr(s, "state t", getattr(s, f"{_LAST_POINT}_t"))
         with f.each(module.rowcount) as r:
             for x in "qv":
-                module.put(f, f"state {x}", r, module.vector(f, f"{_LAST} {x}", r))
+                module.put(f, f"state {x}", r, module.vector(f, f"{_LAST_POINT} {x}", r))
             module.put(f, "stage0 a", r, f.select(begins, 0.0, module.vector(f, "present a", r)))
         self._own.change_rates(f, "stage0 a", "stage0 slip")
 
@@ -69,7 +69,7 @@ class Stabilized(Unprojected):
         if self.slips:
             with f.each(module.rowcount) as r:
                 slips = module.weighted_sum(f, module.method.v[-1], r, module.stage_slips)
-                before = module.vector(f, f"{_LAST} slipped", r)
+                before = module.vector(f, f"{_LAST_POINT} slipped", r)
                 module.put(f, "end slipped", r, before if slips is None else f.fma(h, slips, before))
         self._own.end_step(f)
         self.accelerate_end(f, s)
@@ -91,18 +91,18 @@ class Stabilized(Unprojected):
         The accelerations at the end of the step, without stabilization, become `present a`, and point 3 gets the slips there.
         Point 2 gets the rates with which the step began.
         """
-        module, before = self._in, f"point{POINTS - 2}"
+        module, before = self._in, f"point{NODE_COUNT - 2}"
         accepted, stepped = (self._lanes(f, x) for x in (accept, accept & (s.begin < 0.5)))
         module.copy(f, "end a", "present a", accepted)
         module.copy(f, "stage0 a", f"{before} a", stepped)
         if not self.slips:
             return
         for x in ("slip", "slipped"):
-            for k in range(POINTS - 1):
+            for k in range(NODE_COUNT - 1):
                 module.copy(f, f"point{k + 1} {x}", f"point{k} {x}", accepted)
             with f.each(module.rowcount) as r:
-                new, old = module.vector(f, f"end {x}", r), module.vector(f, f"{_LAST} {x}", r)
-                module.put(f, f"{_LAST} {x}", r, f.select(stepped, new, f.select(accepted, 0.0, old)))
+                new, old = module.vector(f, f"end {x}", r), module.vector(f, f"{_LAST_POINT} {x}", r)
+                module.put(f, f"{_LAST_POINT} {x}", r, f.select(stepped, new, f.select(accepted, 0.0, old)))
         module.copy(f, "stage0 slip", f"{before} slip", stepped)
 
     def _lanes(self, f: Function, mask: Value) -> Value:
@@ -114,7 +114,7 @@ class Stabilized(Unprojected):
     def slipped_between(self, f: Function, s: Lane, r: Value) -> Value:
         """Return one register of the differences of q from the integral of v at the time `next`: a cubic in each step."""
         module, found = self._in, None
-        for k in range(POINTS - 1):
+        for k in range(NODE_COUNT - 1):
             start, end = getattr(s, f"point{k}_t"), getattr(s, f"point{k + 1}_t")
             h = end - start
             x = module.broadcast(f, (s.next - start) / f.select(h > 0.0, h, 1.0))

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from udkjax.native.language.ir import BOOL, DOUBLE, INT, Function, Operand, Value, llvm_type
 from udkjax.native.module.memory import Memory
 
-UNROLLED = 16  # operations on this many registers are unrolled; operations on longer rows are loops over as many
-SUMS = 4  # independent partial sums of a scalar product, to hide the latency of additions
-ENTRIES = 16  # partial sums of a scalar product of one member, in all lanes: its bits do not depend on the count of lanes
+UNROLLED_REGISTERS = 16  # operations on this many registers are unrolled; operations on longer rows are loops over as many
+PARTIAL_SUMS = 4  # independent partial sums of a scalar product, to hide the latency of additions
+MEMBER_SUMS = 16  # partial sums of a scalar product of one member, in all lanes: its bits do not depend on the count of lanes
 
 
 @dataclass(frozen=True)
@@ -234,16 +234,16 @@ class DenseMatrices:
     def over_registers(self, registers: int, do: Callable[[Operand], None]):
         """Run `do` for the index of each register of a row: unrolled or, for long rows, in a loop over several at a time."""
         f = self.f
-        if registers <= UNROLLED:
+        if registers <= UNROLLED_REGISTERS:
             for r in range(registers):
                 do(r)
             return
-        rounds = registers // UNROLLED
+        rounds = registers // UNROLLED_REGISTERS
         with f.each(rounds) as k:
-            first = k * UNROLLED
-            for r in range(UNROLLED):
+            first = k * UNROLLED_REGISTERS
+            for r in range(UNROLLED_REGISTERS):
                 do(first + r)
-        for r in range(rounds * UNROLLED, registers):
+        for r in range(rounds * UNROLLED_REGISTERS, registers):
             do(r)
 
     def sum(self, registers: int, term: Callable[[Operand, Value], Value]) -> Value:
@@ -251,9 +251,9 @@ class DenseMatrices:
 
         `term(r, total)` returns `total` plus the terms of register r.
         """
-        f, count = self.f, SUMS if self.f.width > 1 else max(1, ENTRIES // self.vector)
+        f, count = self.f, PARTIAL_SUMS if self.f.width > 1 else max(1, MEMBER_SUMS // self.vector)
         totals = [self.register(0.0)] * max(1, min(count, registers))  # rows of a free body are empty
-        if registers <= UNROLLED:
+        if registers <= UNROLLED_REGISTERS:
             for r in range(registers):
                 totals[r % len(totals)] = term(r, totals[r % len(totals)])
         else:

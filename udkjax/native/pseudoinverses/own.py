@@ -12,7 +12,7 @@ from udkjax.native.language.program import UnsupportedError
 from udkjax.native.lowering.own_objects import Input, OwnObject, Written, named, written
 from udkjax.native.pseudoinverses.dense import DenseMatrices, DenseMethod
 
-_TRIAL = (2, 3)  # the shape of a matrix by which the operations of a method are looked at
+_TRIAL_SHAPE = (2, 3)  # the shape of a matrix by which the operations of a method are looked at
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class OwnCode(DenseMethod):
             code = cls(method.relative, OwnObject.of(marked))
             if len(code.own.sizes) > 1:
                 raise UnsupportedError("arrays other than rank_tol")
-            code.written(*_TRIAL)
+            code.written(*_TRIAL_SHAPE)
         return code
 
     def evaluate(self, D: Any, tol: Any) -> Any:

@@ -15,7 +15,7 @@ from udkjax.native.pseudoinverses.dense import DenseMatrices, DenseMethod, Matri
 from udkjax.native.pseudoinverses.qr import apply_q, apply_q_transposed, pivoted_qr, qr_matrices
 
 SWEEPS = 30  # maximum number of sweeps; six to eight are usual
-ORTHOGONAL = 1e-15  # largest cosine of the angle between rows that count as orthogonal
+ORTHOGONAL_TOL = 1e-15  # largest cosine of the angle between rows that count as orthogonal
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class SVDCode(DenseMethod):
             with f.each(d.steps) as i, f.each(d.steps, i + 1) as j:
                 row_i, row_j = d.row("D", i), d.row("D", j)
                 a, c, g = squares.entry(i), squares.entry(j), d.dot(row_i, row_j)
-                rotates = g * g > a * c * (ORTHOGONAL * ORTHOGONAL)
+                rotates = g * g > a * c * (ORTHOGONAL_TOL * ORTHOGONAL_TOL)
                 with f.if_(f.any_of(rotates)):
                     has_rotated.value = 1
                     zeta = (c - a) / f.select(rotates, g * 2.0, 1.0)

@@ -5,7 +5,7 @@ import numpy as np
 from udkjax.native.language.ir import DOUBLE, Function, Value
 from udkjax.native.module.layout import Lane
 from udkjax.native.module.module import Module
-from udkjax.native.module.steps import AIM_ACROSS, BEGINS_BEHIND, ENDS_BEFORE, POINTS, SHORTEST_LAST
+from udkjax.native.module.steps import AIM_ACROSS, BEGINS_BEHIND, ENDS_BEFORE, NODE_COUNT, SHORTEST_LAST
 
 
 def aim(module: Module, f: Function, s: Lane):
@@ -26,9 +26,9 @@ def aim(module: Module, f: Function, s: Lane):
         s.lands = f.const(0.0, DOUBLE, f.width)
     else:
         rest = f.min(stop, s.end) - start
-        parts = f.max(float(POINTS - 1) - s.steps, 1.0)
+        parts = f.max(float(NODE_COUNT - 1) - s.steps, 1.0)
         split = start + rest / parts
-        splits = (s.steps < float(POINTS - 2)) & (t1 > split) & (rest > s.smallest * (2.0 * POINTS)) & ~begin
+        splits = (s.steps < float(NODE_COUNT - 2)) & (t1 > split) & (rest > s.smallest * (2.0 * NODE_COUNT)) & ~begin
         splits = splits & (s.next < stop - s.smallest)  # only if outputs are due in between
         splits = module.stiffness.splits(s, splits)
         if module.pieces:

@@ -20,11 +20,11 @@ from udkjax.native.language.power import power
 from udkjax.native.module.layout import Lane
 from udkjax.native.module.module import Module
 from udkjax.native.module.steps import (
+    BREAK_GAP,
     FACTORS,
-    GAP,
-    POINTS,
+    LARGEST_STRETCH,
+    NODE_COUNT,
     RESTART_FACTOR,
-    STRETCH,
     Status,
 )
 from udkjax.native.parts.manifold import velocity_tolerance
@@ -85,7 +85,7 @@ def write_decide(module: Module):
     cost = where(fallback, cost * 2.0 + where(begin, f.const(0.0, DOUBLE, f.width), 1.0), cost)
     s.where(stepping, evaluations=s.evaluations + cost, tried=tried, h=h, code=code)
     # Points beyond a sudden change, which shorten steps again and again, say nothing of the motion before.
-    abrupt = stepping & ~accept & (s.h * STRETCH < s.point3_t - s.point2_t)
+    abrupt = stepping & ~accept & (s.h * LARGEST_STRETCH < s.point3_t - s.point2_t)
     s.abrupt = where(abrupt, yes, 0.0)
     s.until = where(abrupt, s.point3_t, _due_until(module, f, s, accept, stepping & begin))
     s.where(accept, accepted=s.accepted + 1.0)
@@ -127,11 +127,11 @@ def _accept_step(module: Module, f: Function, s: Lane, accept: Value) -> Value:
     lost = f.variable(0.0)
     with f.if_(f.any_of(accept)):
         with f.if_(f.any_of(accept & module.interpolates(f, s))):
-            for k in range(POINTS - 1):
+            for k in range(NODE_COUNT - 1):
                 module.copy_point(f, accept, f"point{k + 1}", f"point{k}")
-        for k in range(POINTS - 1):
+        for k in range(NODE_COUNT - 1):
             s.where(accept, **{f"point{k}_t": getattr(s, f"point{k + 1}_t")})
-        module.copy_point(f, accept, ("state q", "result v", "result a"), f"point{POINTS - 1}")
+        module.copy_point(f, accept, ("state q", "result v", "result a"), f"point{NODE_COUNT - 1}")
         s.where(accept, point3_t=s.t1)
         module.stiffness.shift_points(f, s, accept)
         s.where(accept, distance0=s.distance1)
@@ -162,8 +162,8 @@ def _due_until(module: Module, f: Function, s: Lane, accept: Value, begun: Value
     # The last step may end slightly before a breakpoint at the end of the run, where outputs are also due.
     until = f.select(ready, f.select(s.last > 0.5, f.max(s.t1, s.end), s.t1), -np.inf)
     if module.plan.breaks:
-        enough = ~begun & (alone | (s.steps >= float(POINTS - 1)) | (s.lands > 0.5) | (s.last > 0.5) | (s.steps < 0.0))
-        until = f.select(enough, until + f.select(s.lands > 0.5, s.smallest * GAP, 0.0), -np.inf)
+        enough = ~begun & (alone | (s.steps >= float(NODE_COUNT - 1)) | (s.lands > 0.5) | (s.last > 0.5) | (s.steps < 0.0))
+        until = f.select(enough, until + f.select(s.lands > 0.5, s.smallest * BREAK_GAP, 0.0), -np.inf)
     if module.pieces:  # interpolation through both ends of the tiny step that follows would amplify rounding errors
         until = f.select(module.steps_across_next(s), s.point3_t, until)
     return until

@@ -3,7 +3,7 @@
 from udkjax.native.language.ir import BOOL, DOUBLE, POINTER, Function, Value
 from udkjax.native.module.layout import Lane, Layout
 from udkjax.native.module.module import Module
-from udkjax.native.module.steps import POINTS, SHORT_STEP, STRETCH
+from udkjax.native.module.steps import LARGEST_STRETCH, NODE_COUNT, SHORT_STEP
 
 
 def write_differences(module: Module, name: str = "differences", to: tuple[str, Layout] | None = None):
@@ -16,15 +16,15 @@ def write_differences(module: Module, name: str = "differences", to: tuple[str, 
     inverse, used = _spacing(module, f, s)
     short = _short_steps(module, f, s)
     with f.each(module.registers(pointer)) as r:
-        points = {x: [module.vector(f, f"point{POINTS - 1 - k} {x}", r, pointer) for k in range(POINTS)] for x in "qva"}
+        points = {x: [module.vector(f, f"point{NODE_COUNT - 1 - k} {x}", r, pointer) for k in range(NODE_COUNT)] for x in "qva"}
         if module.projection.slips:
-            points["q"] = [q - module.vector(f, f"point{POINTS - 1 - k} slipped", r) for k, q in enumerate(points["q"])]
+            points["q"] = [q - module.vector(f, f"point{NODE_COUNT - 1 - k} slipped", r) for k, q in enumerate(points["q"])]
         column = [x for x in points["q"] for _ in range(3)]  # each point is a triple node, of its q, v and a (Hermite)
         given = {1: points["v"], 2: [a * 0.5 for a in points["a"]]}
         module.put(f, "difference0", r, column[0], pointer)
-        for degree in range(1, 3 * POINTS):
+        for degree in range(1, 3 * NODE_COUNT):
             following = []
-            for i in range(3 * POINTS - degree):
+            for i in range(3 * NODE_COUNT - degree):
                 first, last = i // 3, (i + degree) // 3  # points
                 difference = given[degree][first] if first == last else (column[i + 1] - column[i]) * inverse[first, last]
                 if degree == 1 and first != last:
@@ -44,25 +44,27 @@ def _spacing(module: Module, f: Function, s: Lane) -> tuple[dict[tuple[int, int]
     much shorter than it. A polynomial of high degree through such close points would multiply rounding errors; a jump of the
     accelerations, as between the two states at a breakpoint; and errors of accelerations from an implicit method.
     """
-    times = [getattr(s, f"point{POINTS - 1 - k}_t") for k in range(POINTS)]
+    times = [getattr(s, f"point{NODE_COUNT - 1 - k}_t") for k in range(NODE_COUNT)]
     step = times[0] - times[1]
     inverse: dict[tuple[int, int], Value] = {}
-    for i in range(POINTS):
-        for j in range(i + 1, POINTS):
+    for i in range(NODE_COUNT):
+        for j in range(i + 1, NODE_COUNT):
             d = times[j] - times[i]
             inverse[i, j] = module.broadcast(f, 1.0 / f.select(d.is_(0.0), 1.0, d))
     used: list[Value | None] = [None, None]
     all_near = f.const(not module.method.is_implicit, BOOL, f.width)
-    for k in range(1, POINTS - 1):
-        near = (times[k] - times[k + 1]) * STRETCH >= step
-        all_near = all_near & module.stiffness.between_explicit(s, near, POINTS - k)
+    for k in range(1, NODE_COUNT - 1):
+        near = (times[k] - times[k + 1]) * LARGEST_STRETCH >= step
+        all_near = all_near & module.stiffness.between_explicit(s, near, NODE_COUNT - k)
         used.append(all_near)
     return inverse, used
 
 
 def _short_steps(module: Module, f: Function, s: Lane) -> list[tuple[Value, Value]]:
     """Return for each step between points, the latest first, the mask of the lanes in which it is short, and its length (s)."""
-    steps = [getattr(s, f"point{POINTS - 1 - k}_t") - getattr(s, f"point{POINTS - 2 - k}_t") for k in range(POINTS - 1)]
+    steps = [
+        getattr(s, f"point{NODE_COUNT - 1 - k}_t") - getattr(s, f"point{NODE_COUNT - 2 - k}_t") for k in range(NODE_COUNT - 1)
+    ]
     return [(step * s.omega < SHORT_STEP, module.broadcast(f, step)) for step in steps]
 
 
@@ -70,9 +72,9 @@ def write_differences_back(module: Module):
     """Write `differences_back(work)`: pull the cotangents of the divided differences back to the points, and clear them."""
     f, s = module.function("differences_back")
     active, (inverse, used), short = s.at > 0.5, _spacing(module, f, s), _short_steps(module, f, s)
-    zero, count = f.const(0.0, DOUBLE, module.plan.vector), 3 * POINTS
+    zero, count = f.const(0.0, DOUBLE, module.plan.vector), 3 * NODE_COUNT
     with f.each(module.rowcount) as r:
-        bars: dict[str, list[Value]] = {x: [zero] * POINTS for x in "qva"}
+        bars: dict[str, list[Value]] = {x: [zero] * NODE_COUNT for x in "qva"}
         column: list[Value] = []
         for degree in reversed(range(count)):
             leading, mask = module.vector(f, f"bar difference{degree}", r), used[degree // 3]
@@ -98,9 +100,9 @@ def write_differences_back(module: Module):
             module.put(f, f"bar difference{degree}", r, zero)
         for i, bar in enumerate(column):
             bars["q"][i // 3] = bars["q"][i // 3] + bar
-        for k in range(POINTS):
+        for k in range(NODE_COUNT):
             for x in "qva":
-                name = f"bar point{POINTS - 1 - k} {x}"
+                name = f"bar point{NODE_COUNT - 1 - k} {x}"
                 old = module.vector(f, name, r)
                 module.put(f, name, r, f.select(active, old + bars[x][k], old))
 
@@ -112,12 +114,12 @@ def write_between(module: Module, name: str = "between", to: tuple[str, Layout] 
     """
     pointer = to[0] if to else "work"
     f, s = module.function(name, [(POINTER, x) for x in ("work", *([pointer] if to else []))])
-    ahead = [module.broadcast(f, s.next - getattr(s, f"point{POINTS - 1 - k}_t")) for k in range(POINTS)]
+    ahead = [module.broadcast(f, s.next - getattr(s, f"point{NODE_COUNT - 1 - k}_t")) for k in range(NODE_COUNT)]
     if not to:
         setattr(s, "state t", s.next)
     with f.each(module.registers(pointer)) as r:
-        q, v = module.vector(f, f"difference{3 * POINTS - 1}", r, pointer), f.const(0.0, DOUBLE, module.plan.vector)
-        for k in reversed(range(3 * POINTS - 1)):
+        q, v = module.vector(f, f"difference{3 * NODE_COUNT - 1}", r, pointer), f.const(0.0, DOUBLE, module.plan.vector)
+        for k in reversed(range(3 * NODE_COUNT - 1)):
             d = ahead[k // 3]
             v = f.fma(v, d, q)
             q = f.fma(q, d, module.vector(f, f"difference{k}", r, pointer))

@@ -5,10 +5,10 @@ from typing import Any
 import numpy as np
 
 from udkjax.native.language.ir import DOUBLE, INT, POINTER, Function, Value
-from udkjax.native.module.layout import INFO, LANE_NUMBERS, SETTINGS, Lane
+from udkjax.native.module.layout import INFO_NAMES, LANE_NUMBERS, SETTINGS, Lane
 from udkjax.native.module.module import Module
 from udkjax.native.module.samples import enter_first_row, write_enter
-from udkjax.native.module.steps import LOOK_AHEAD, PATIENCE, POINTS, Status
+from udkjax.native.module.steps import LOOK_AHEAD, MEASURING_PERIOD, NODE_COUNT, Status
 from udkjax.native.parts.manifold import largest_violation
 
 
@@ -39,7 +39,7 @@ def write_begin(module: Module):
         put("inverse unit", 1.0 / unit, i)
         put("scale q", settings["atol"] * unit, i)
         put("scale v", settings["atol"] * unit * settings["omega"], i)
-        for j in range(POINTS):
+        for j in range(NODE_COUNT):
             put(f"point{j} q", f.load(q, i), i)
             put(f"point{j} v", f.load(v, i), i)
             put(f"point{j} a", 0.0, i)
@@ -62,13 +62,13 @@ def write_begin(module: Module):
     }
     for name, value in first.items():
         put(name, value)
-    for j in range(POINTS):
+    for j in range(NODE_COUNT):
         put(f"point{j}_t", start)
-    for name in (f"distance{j}" for j in range(POINTS - 1)):
+    for name in (f"distance{j}" for j in range(NODE_COUNT - 1)):
         put(name, np.inf)
     put("stiff", float(module.method.is_implicit))
     for name in ("patience", "watch"):
-        put(name, PATIENCE)
+        put(name, MEASURING_PERIOD)
     for name in ("tried", "accepted", "steps"):
         put(name, -1.0)
     put("active", 1.0)
@@ -96,7 +96,7 @@ def _marked_rank(module: Module, f: Function, member: Value, most: Value) -> Val
 def write_finish(module: Module):
     """Write `finish_members(work, call)`: store the outputs of completed members, in lanes that are `due`.
 
-    These are the first and the last state, and the output "info" (`INFO`); outputs that the run has not reached become NaN.
+    These are the first and the last state, and the output "info" (`INFO_NAMES`); outputs that the run has not reached become NaN.
     """
     f, s = module.function("finish_members", [(POINTER, "work"), (POINTER, "call")])
     times = module.field(f, "times")
@@ -130,12 +130,12 @@ def write_finish(module: Module):
 
 
 def _write_info(module: Module, f: Function, s: Lane, k: Value):
-    info = module.result_address(f, "info", module.to_int(f, f.lane(s.member, k)), len(INFO) + 2 * module.n)
+    info = module.result_address(f, "info", module.to_int(f, f.lane(s.member, k)), len(INFO_NAMES) + 2 * module.n)
     ends = {"t": s.point3_t, "accepted": f.max(s.accepted, 0.0)}  # -1 if the initial state was not accepted
-    for j, name in enumerate(INFO):
+    for j, name in enumerate(INFO_NAMES):
         f.store(f.lane(ends[name] if name in ends else getattr(s, name), k), info, j)
-    module.copy_lane(f, info, len(INFO), "point3 q", k)
-    module.copy_lane(f, info, len(INFO) + module.n, "point3 v", k)
+    module.copy_lane(f, info, len(INFO_NAMES), "point3 q", k)
+    module.copy_lane(f, info, len(INFO_NAMES) + module.n, "point3 v", k)
 
 
 def _find_cause(module: Module, f: Function, s: Lane):

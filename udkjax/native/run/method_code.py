@@ -9,7 +9,7 @@ from udkjax.equations.terms.scale_program import RANK_TOL
 from udkjax.native.language.program import UnsupportedError
 from udkjax.native.lowering.own_objects import numbers_of
 from udkjax.native.module.layout import FORMULATION_SETTINGS
-from udkjax.native.parts.formulations import MASS, AugmentedCode, FormulationCode, NullSpaceCode
+from udkjax.native.parts.formulations import MASS_SETTING, AugmentedCode, FormulationCode, NullSpaceCode
 from udkjax.native.parts.own_formulation import OwnFormulationCode, number_names
 from udkjax.native.parts.partitioning import PartitioningCode
 from udkjax.native.pseudoinverses import dense_method
@@ -64,7 +64,7 @@ class MethodCode(NamedTuple):
         """
         if isinstance(formulation_code(formulation), OwnFormulationCode):
             numbers = [number for x in numbers_of(formulation) for number in x.reshape(-1)]
-            return {MASS: scales.mass, **dict(zip(number_names(len(numbers)), numbers, strict=True))}
+            return {MASS_SETTING: scales.mass, **dict(zip(number_names(len(numbers)), numbers, strict=True))}
         if isinstance(formulation, Augmented):
             tol = None if formulation.method is None else formulation.method.rank_tol
             tol = RANK_TOL**2 if tol is None else tol

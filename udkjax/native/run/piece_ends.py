@@ -5,7 +5,7 @@ from collections.abc import Callable
 from udkjax.native.language.ir import DOUBLE, INT, Function, Value
 from udkjax.native.module.layout import Lane
 from udkjax.native.module.module import Module
-from udkjax.native.module.steps import EDGE, HALVINGS, NEAR_END
+from udkjax.native.module.steps import EDGE_STEP, NEAR_END_FRACTION, PIECE_HALVINGS
 
 
 def locate_end(f: Function, lanes: Value, at_end: Value, look_at: Callable[[Value], tuple[Value, Value]]) -> Value:
@@ -28,13 +28,13 @@ def locate_end(f: Function, lanes: Value, at_end: Value, look_at: Callable[[Valu
     load_low, load_high = f.variable(1.0), f.variable(at_end)
 
     def width() -> Value:
-        is_near_end = (low.value < NEAR_END) | (high.value > 1 - NEAR_END)
-        return f.select(is_near_end, f.const(EDGE / 8, DOUBLE, f.width), NEAR_END / 8)
+        is_near_end = (low.value < NEAR_END_FRACTION) | (high.value > 1 - NEAR_END_FRACTION)
+        return f.select(is_near_end, f.const(EDGE_STEP / 8, DOUBLE, f.width), NEAR_END_FRACTION / 8)
 
     def is_open() -> Value:
         return lanes & (high.value - low.value > width())
 
-    with f.while_(lambda: f.any_of(is_open()) & (count.value < HALVINGS)):
+    with f.while_(lambda: f.any_of(is_open()) & (count.value < PIECE_HALVINGS)):
         open_, a, b, margin = is_open(), low.value, high.value, width() * 0.5
         has_sign = (load_low.value > 0.0) & (load_high.value < 0.0)
         zero = f.fma(load_low.value / (load_low.value - load_high.value), b - a, a)

@@ -13,12 +13,12 @@ from udkjax.native.module.steps import (
     AIM_ACROSS,
     AIM_BEFORE,
     AIM_BEYOND,
-    EDGE,
+    EDGE_STEP,
     FACTORS,
-    NEAR_END,
-    NEAR_ZERO,
-    NO_LOAD,
-    TRIES,
+    NEAR_END_FRACTION,
+    NEAR_ZERO_SHARE,
+    NEGLIGIBLE_LOAD,
+    PIECE_TRIES,
 )
 from udkjax.native.run.piece_ends import interpolate_step, locate_end, moves_by_tolerance
 from udkjax.native.run.runge_kutta import stage_state
@@ -59,7 +59,7 @@ class _EndOfPiece:
         self._f, self._s = f, s
         self._first_edge = module.pieces - module.edges
         self._goes_across, per_unit = s.aim.is_(float(AIM_ACROSS)), module.entry(f, "inverse unit", f.const(0, INT))
-        self._loaded = s.tolerance * NO_LOAD * s.omega / ((s.t1 - s.point3_t) * per_unit)  # (m/s^2)
+        self._loaded = s.tolerance * NEGLIGIBLE_LOAD * s.omega / ((s.t1 - s.point3_t) * per_unit)  # (m/s^2)
 
     # --- the pieces at a state
 
@@ -149,13 +149,13 @@ class _EndOfPiece:
         strays = f.variable(f.const(False, BOOL, f.width), BOOL)
 
         def look_at_last_stages(lanes: Value):
-            for i in np.flatnonzero(module.method.nodes[: module.method.stages] > 1 - NEAR_END).tolist():
+            for i in np.flatnonzero(module.method.nodes[: module.method.stages] > 1 - NEAR_END_FRACTION).tolist():
                 stage_state(module, f, s, i)
                 self._look()
                 strays.value = strays.value | (self._moved() & lanes)
 
         if module.edges:
-            is_near = self._any_edge(lambda current, previous: f.abs(current) < f.abs(previous) * NEAR_ZERO)
+            is_near = self._any_edge(lambda current, previous: f.abs(current) < f.abs(previous) * NEAR_ZERO_SHARE)
             lanes = (s.again > 0.5) & (is_near | f.const(self._first_edge > 0, BOOL, f.width))
             with f.if_(f.any_of(lanes)):
                 look_at_last_stages(lanes)
@@ -185,7 +185,7 @@ class _EndOfPiece:
         can_leave = stepping & (s.begin < 0.5) & is_motion & (self._goes_across | moves_by_tolerance(module, f, s))
         turns = self._turned()
         leaves = can_leave & self._moved()
-        again = s.aim.is_not(float(AIM_ACROSS)) & (s.tries < float(TRIES))
+        again = s.aim.is_not(float(AIM_ACROSS)) & (s.tries < float(PIECE_TRIES))
 
         def look_at(share: Value) -> tuple[Value, Value]:
             self._go_to(f.fma(share, step, s.point3_t), lambda r: interpolate_step(module, f, share, step, r))
@@ -213,21 +213,21 @@ class _EndOfPiece:
         f, s, where = self._f, self._s, self._f.select
         stepping, is_accurate, leaves, repeats, shortens, turns = found
         yes, inf = f.const(1.0, DOUBLE, f.width), f.const(np.inf, DOUBLE, f.width)
-        is_near_end = f.min(share, yes - share) <= NEAR_END
+        is_near_end = f.min(share, yes - share) <= NEAR_END_FRACTION
         s.where(leaves & ~repeats, lands=1.0)
         goes_across = leaves & self._goes_across
         s.where(stepping, crosses=where(goes_across, where(turns, f.const(ACROSS_EDGE, DOUBLE, f.width), ACROSS_PIECE), 0.0))
         short = (s.t1 < s.crossing - s.smallest) & (s.lands < 0.5)
         reached = stepping & is_accurate & ~leaves & ~shortens & ~short & aim.is_(float(AIM_BEFORE))
-        across = reached | (repeats & (share <= EDGE))
+        across = reached | (repeats & (share <= EDGE_STEP))
         before, beyond = (f.const(float(x), DOUBLE, f.width) for x in (AIM_BEFORE, AIM_BEYOND))
         aim = where(repeats, where(is_near_end, before, beyond), where(short, aim, beyond))
-        expected = f.fma(where(is_near_end, share - EDGE / 2, share + NEAR_END / 2), step, s.point3_t)
+        expected = f.fma(where(is_near_end, share - EDGE_STEP / 2, share + NEAR_END_FRACTION / 2), step, s.point3_t)
         crossing = where(repeats, expected, where(short, s.crossing, inf))
-        crossing = where(across, f.fma(s.h, EDGE, where(reached, s.t1, s.point3_t)), crossing)
+        crossing = where(across, f.fma(s.h, EDGE_STEP, where(reached, s.t1, s.point3_t)), crossing)
         aim = where(shortens, beyond, aim)
         farthest = max(1.0, float(self._module.method.nodes.max()))  # some methods have stages after the end of the step
-        crossing = where(shortens, f.fma(step, (1 - NEAR_END) / farthest, s.point3_t), crossing)
+        crossing = where(shortens, f.fma(step, (1 - NEAR_END_FRACTION) / farthest, s.point3_t), crossing)
         repeats = repeats | shortens
         tries = where(repeats, s.tries + 1.0, where(is_accurate, 0.0, s.tries))
         s.where(stepping, crossing=crossing, aim=where(across, f.const(float(AIM_ACROSS), DOUBLE, f.width), aim), tries=tries)

@@ -21,7 +21,7 @@ from udkjax.native.module.tableau import EULER
 from udkjax.native.parts.manifold import iterate_newton, largest_violation
 from udkjax.native.run.members import write_begin
 
-ASIDE = CLOSURE.aside
+STEP_ASIDE = CLOSURE.aside
 
 
 class RowMarks(Module):
@@ -61,7 +61,7 @@ class RowMarks(Module):
         count = self._mark_rows(f, None)
         is_free = self._step_aside(f, s)
         is_closed = largest_violation(self, f) < CLOSURE.tol
-        is_found = is_closed & ((self._distance(f) > ASIDE.stays * ASIDE.length) | ~is_free)
+        is_found = is_closed & ((self._distance(f) > STEP_ASIDE.stays * STEP_ASIDE.length) | ~is_free)
         self._mark_rows(f, lambda found: found > count)
         with f.each(self.m) as i:
             self.put_entry(f, "marks", i, f.select(is_found, self.entry(f, "marks", i), 1.0))
@@ -82,18 +82,18 @@ class RowMarks(Module):
         )
         with f.each(self.n) as i:
             self.put_entry(f, "state dq", i, self.entry(f, "point3 v", i))
-        moves = f.like(self._size(f, "state dq") > s.omega * ASIDE.free, BOOL, width)
+        moves = f.like(self._size(f, "state dq") > s.omega * STEP_ASIDE.free, BOOL, width)
         with f.each(self.n) as i:
             random = f.like(f.load(Value(f, "@direction", POINTER), i), DOUBLE, width) / self.entry(f, "inverse unit", i)
             self.put_entry(f, "state dq", i, f.select(moves, self.entry(f, "state dq", i) / s.omega, random))
         self.invoke(f, "tangent_part")
         size = self._size(f, "result dq")
-        is_free = size > ASIDE.free
-        scale = f.like(f.select(is_free, ASIDE.length / f.select(is_free, size, 1.0), 0.0), DOUBLE, width)
+        is_free = size > STEP_ASIDE.free
+        scale = f.like(f.select(is_free, STEP_ASIDE.length / f.select(is_free, size, 1.0), 0.0), DOUBLE, width)
         with f.each(self.n) as i:
             self.put_entry(f, "state q", i, f.fma(self.entry(f, "result dq", i), scale, self.entry(f, "state q", i)))
-        setattr(s, "state t", s.start + ASIDE.length / s.omega)
-        iterate_newton(self, f, s, s.active > 0.5, lambda _: self.invoke(f, "newton_q"), ASIDE.corrections)
+        setattr(s, "state t", s.start + STEP_ASIDE.length / s.omega)
+        iterate_newton(self, f, s, s.active > 0.5, lambda _: self.invoke(f, "newton_q"), STEP_ASIDE.corrections)
         self.invoke(f, "psi")
         return f.like(is_free, BOOL, width)
 

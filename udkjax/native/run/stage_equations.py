@@ -23,8 +23,8 @@ import numpy as np
 from udkjax.native.language.ir import DOUBLE, INT, Function, Operand, Value
 from udkjax.native.module.layout import Lane, Layout
 from udkjax.native.module.module import Module
-from udkjax.native.module.program_derivative import SLOPES, ProgramDerivative
-from udkjax.native.module.steps import DIVERGING, EAGER, FADING, RENEWALS, SLOW, STAGE_ITERATIONS, STAGE_TOL
+from udkjax.native.module.program_derivative import SLOPES_SUFFIX, ProgramDerivative
+from udkjax.native.module.steps import DIVERGING_RATE, EAGER_STEPS, RATE_FADING, RENEWALS, SLOW_RATE, STAGE_ITERATIONS, STAGE_TOL
 from udkjax.native.module.tableau import Method
 from udkjax.native.pseudoinverses.dense import DenseLayout, DenseMatrices
 from udkjax.native.pseudoinverses.lu import OrderedLUCode
@@ -110,7 +110,7 @@ class StageEquations:
         work, d, lanes = f.given["work"], DenseMatrices(layout, f), self._tangent.width
         tangent = f.given["tangent"] = module.address(f, "slope tangent")
         module.friction.settle(f, "residual a")
-        f.call(f"evaluation_{SLOPES}", work, module.address(f, "residual a"), module.address(f, "slopes linearization"))
+        f.call(f"evaluation_{SLOPES_SUFFIX}", work, module.address(f, "residual a"), module.address(f, "slopes linearization"))
         hg = s.step * self._method.diagonal
         of_v = hg if module.plan.width > 1 else f.repeat(hg, lanes) if lanes > 1 else hg
         of_q = of_v * of_v
@@ -119,7 +119,7 @@ class StageEquations:
             with f.each(self._tangent.size) as k:
                 f.store(0.0, tangent, k * lanes, lanes)
             self._seed(f, first, of_q, of_v)
-            f.call(f"forward_{SLOPES}", work, module.address(f, "slopes linearization"), tangent, self._slope_address(f))
+            f.call(f"forward_{SLOPES_SUFFIX}", work, module.address(f, "slopes linearization"), tangent, self._slope_address(f))
             self._enter_columns(f, d, first, to, None if to == "D" else s.renew > 0.5)
         if to != "D":
             with f.each(module.n) as i:
@@ -194,18 +194,18 @@ class StageEquations:
 
             size = module.largest(f, change)
             is_first = s.size.is_(np.inf)
-            rate = f.select(is_first, s.contraction, f.max(s.contraction * FADING, size / f.max(s.size, 1e-300)))
+            rate = f.select(is_first, s.contraction, f.max(s.contraction * RATE_FADING, size / f.max(s.size, 1e-300)))
             converged = size * f.min(rate, 1.0) <= STAGE_TOL
-            is_slow = active & ~converged & ~is_first & (rate > SLOW)
+            is_slow = active & ~converged & ~is_first & (rate > SLOW_RATE)
             renews = is_slow & (size < float("inf")) & (s.renewals < RENEWALS)
-            diverges = ~(size < float("inf")) | (is_slow & (rate > DIVERGING) & ~renews)
+            diverges = ~(size < float("inf")) | (is_slow & (rate > DIVERGING_RATE) & ~renews)
             s.where(active, contraction=f.min(rate, 1.0), size=size, iterations=s.iterations + 1.0)
             s.where(active & diverges & ~converged, diverged=1.0)
             s.iterating = f.select(active & ~converged & ~diverges, yes, 0.0)
             s.renew = f.select(renews, yes, 0.0)
             with f.if_(f.any_of(renews)):
                 f.call("factor_stage", f.given["work"])
-                s.where(renews, renewals=s.renewals + 1.0, eager=EAGER, size=np.inf, contraction=SLOW)
+                s.where(renews, renewals=s.renewals + 1.0, eager=EAGER_STEPS, size=np.inf, contraction=SLOW_RATE)
             k.value = k.value + 1
         s.where(s.iterating > 0.5, diverged=1.0)
 

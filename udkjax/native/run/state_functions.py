@@ -16,7 +16,7 @@ from typing import ClassVar
 from udkjax.equations.programs.run_programs import RunPrograms
 from udkjax.native.language.ir import DOUBLE, INT, POINTER, Function, Value
 from udkjax.native.language.loops import LoopWriter
-from udkjax.native.language.text import ALLOCATION, text_of_module
+from udkjax.native.language.text import ALLOCATION_DECLARATIONS, text_of_module
 from udkjax.native.module.layout import Lane, Layout, Plan
 from udkjax.native.module.memory import Memory, ThreadCode
 from udkjax.native.module.steps import ROUNDING_PIVOT
@@ -249,7 +249,7 @@ class ScaleCode(Memory):
             self._find_scales(f, work, member.value)
             member.value = take()
         f.line(f"call void @free(ptr {block.name})")
-        return text_of_module([*loops.functions, f], loops.globals, ALLOCATION)
+        return text_of_module([*loops.functions, f], loops.globals, ALLOCATION_DECLARATIONS)
 
     def thread_code(self) -> ThreadCode:
         loops = self._write_loops()

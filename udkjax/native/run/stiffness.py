@@ -21,17 +21,17 @@ from udkjax.native.module.layout import Lane
 from udkjax.native.module.module import Module
 from udkjax.native.module.parts import BeginMember, StiffnessPart
 from udkjax.native.module.steps import (
-    CLEARLY,
-    CORRECTIONS,
+    CORRECTION_COST,
     FACTORS,
-    LIMIT,
-    PATIENCE,
-    POINTS,
-    SLOPE,
-    SLOPE_IN_LANES,
-    STABLE,
+    MEASURING_PERIOD,
+    NODE_COUNT,
+    PAYING_MARGIN,
+    SLOPE_COST,
+    SLOPE_COST_IN_LANES,
+    STABILITY_LIMIT,
     STAGE_SHRINK,
-    UNPAID,
+    STIFF_LIMIT,
+    UNPAID_STEPS,
 )
 from udkjax.native.module.tableau import Method
 from udkjax.native.pseudoinverses.dense import DenseMatrices
@@ -53,7 +53,7 @@ def stiffness_of(module: Module, is_differentiated: bool) -> StiffnessPart:
 
 
 class LeavingIfStiff(StiffnessPart):
-    """Explicit steps alone: `speed` is measured now and then, and a run leaves the module when it exceeds `LIMIT`."""
+    """Explicit steps alone: `speed` is measured now and then, and a run leaves the module when it exceeds `STIFF_LIMIT`."""
 
     pointers = leaving.GLOBALS
 
@@ -71,8 +71,8 @@ class LeavingIfStiff(StiffnessPart):
     def choose_next(self, f: Function, s: Lane, stepping: Value, accept: Value, implicit: Value, tries: Value | None):
         measured = accept & (s.begin < 0.5) & (s.tried > s.watch)
         with f.if_(f.any_of(measured)):
-            s.where(measured, watch=s.tried + PATIENCE)
-            s.where(measured & (s.speed > LIMIT), stiff=1.0)
+            s.where(measured, watch=s.tried + MEASURING_PERIOD)
+            s.where(measured & (s.speed > STIFF_LIMIT), stiff=1.0)
 
     def begin_run(self, f: Function):
         leaving.go_on_if_loaded(f)
@@ -93,7 +93,7 @@ class LeavingIfStiff(StiffnessPart):
             leaving.go_on(module, f, left)
 
     def mark(self, text: str) -> str:
-        return f"{apart(leaving.DIFFERENT)}\n{text}"
+        return f"{apart(leaving.DIFFERENT_FUNCTIONS)}\n{text}"
 
 
 class ImplicitSteps(StiffnessPart):
@@ -195,7 +195,7 @@ class ChosenSteps(ImplicitSteps):
         return stepping & (s.trial > 0.0)
 
     def shift_points(self, f: Function, s: Lane, accept: Value):
-        for k in range(POINTS - 1):
+        for k in range(NODE_COUNT - 1):
             s.where(accept, **{f"point{k}_solved": getattr(s, f"point{k + 1}_solved")})
         s.where(accept, point3_solved=f.max(-s.begin, 0.0))
 
@@ -211,25 +211,25 @@ class ChosenSteps(ImplicitSteps):
         implicit = stepping & (s.begin < -0.5)
         measured = accept & (s.begin < 0.5) & (s.begin > -0.5) & (s.tried > s.watch)
         with f.if_(f.any_of(measured | implicit)):
-            length = STABLE * self.gain  # length of a step that pays, times the largest rate
+            length = STABILITY_LIMIT * self.gain  # length of a step that pays, times the largest rate
             s.where(accept & tries, stiff=1.0)
             pays = s.growth >= (self._by.diagonal * length) ** 2  # a lower bound: stiff dampers make the growth smaller
             s.where(implicit, unpaid=f.select(pays | tries, f.const(0.0, DOUBLE, f.width), s.unpaid + 1.0))
-            returns = implicit & (s.unpaid >= UNPAID)
+            returns = implicit & (s.unpaid >= UNPAID_STEPS)
             fails = returns | (tries & ~accept)
             s.where(returns, stiff=0.0, rate=np.inf)
             s.where(fails, patience=s.patience * 2.0)
             s.where(fails | measured, watch=s.tried + s.patience)
-            is_near = measured & (s.speed > LIMIT)
-            trial = f.select(is_near, s.step * (length * CLEARLY) / f.select(is_near, s.speed, 1.0), 0.0)
+            is_near = measured & (s.speed > STIFF_LIMIT)
+            trial = f.select(is_near, s.step * (length * PAYING_MARGIN) / f.select(is_near, s.speed, 1.0), 0.0)
             s.where(stepping, trial=trial)
 
     @property
     def gain(self) -> float:
         """The ratio of the length of an implicit step to that of an explicit one above which the implicit step pays."""
         module = self._in
-        slopes = module.n * (SLOPE_IN_LANES if module.plan.unrolled else SLOPE)
-        return (CORRECTIONS * (self._by.stages - 1) + slopes) / module.method.stages
+        slopes = module.n * (SLOPE_COST_IN_LANES if module.plan.unrolled else SLOPE_COST)
+        return (CORRECTION_COST * (self._by.stages - 1) + slopes) / module.method.stages
 
     # --- the end of the next step
 
@@ -246,7 +246,7 @@ class ChosenSteps(ImplicitSteps):
     def ends_at_output(self, f: Function, s: Lane, begin: Value, start: Value, t1: Value, stop: Value) -> Value:
         # A jump at the breakpoint beside a stiff damper is over at once, and its acceleration says nothing of states between
         # the ends of a step: the first outputs are ends of steps.
-        is_output = (s.stiff > 0.5) & (s.trial <= 0.0) & (s.steps < float(POINTS - 1)) & ~begin
+        is_output = (s.stiff > 0.5) & (s.trial <= 0.0) & (s.steps < float(NODE_COUNT - 1)) & ~begin
         return is_output & (s.next > start + s.smallest * 2.0) & (s.next < f.min(t1, stop) - s.smallest * 2.0)
 
     def next_begin(self, f: Function, s: Lane) -> Value:
@@ -267,7 +267,7 @@ class ChosenSteps(ImplicitSteps):
         return [run]
 
     def mark(self, text: str) -> str:
-        return f"{apart(self._functions | leaving.DIFFERENT)}\n{text}"
+        return f"{apart(self._functions | leaving.DIFFERENT_FUNCTIONS)}\n{text}"
 
 
 def _watch_speed(module: Module, f: Function, s: Lane):

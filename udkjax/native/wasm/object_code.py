@@ -12,7 +12,7 @@ MAGIC = b"\0asm\1\0\0\0"
 CUSTOM, IMPORTS, EXPORTS, DATA = 0, 2, 7, 11  # section ids; sections are in this order, except the data count before the code
 SYMBOL_TABLE = 8  # subsection of "linking"
 FUNCTION_SYMBOL, DATA_SYMBOL, SECTION_SYMBOL = 0, 1, 3  # kinds of symbols; all others have an index like functions
-UNDEFINED, EXPLICIT_NAME = 0x10, 0x40  # flags of symbols
+UNDEFINED_FLAG, EXPLICIT_NAME = 0x10, 0x40  # flags of symbols
 I32_CONST = 0x41  # the opcode
 
 
@@ -126,7 +126,7 @@ def _function_numbers(sections: Sequence[tuple[int, bytes]]) -> dict[str, int]:
 def _symbol(table: Reader) -> tuple[int, str, int]:
     """Read a symbol; return its kind, its name ("" unless it is defined in this object), and its index."""
     kind, flags = table.byte(), table.number()
-    defined = not flags & UNDEFINED
+    defined = not flags & UNDEFINED_FLAG
     if kind == DATA_SYMBOL:
         table.block()
         for _ in range(3 if defined else 0):  # segment, offset, size

@@ -62,7 +62,13 @@ def compile_wasm(text: str, exports: tuple[str, ...]) -> LinkedModule:
     code = code_cache.read(key)
     if code is None:
         target = machine.llvm_for_all_targets().Target.from_triple(TRIPLE)
-        options = {"cpu": "generic", "features": FEATURES, "opt": machine.LEVEL, "reloc": "static", "codemodel": "small"}
+        options = {
+            "cpu": "generic",
+            "features": FEATURES,
+            "opt": machine.OPTIMIZATION_LEVEL,
+            "reloc": "static",
+            "codemodel": "small",
+        }
         code = machine.object_code(text, target.create_target_machine(**options), TRIPLE)
         code_cache.write(key, code)
     return link(code, exports)

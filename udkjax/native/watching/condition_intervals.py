@@ -4,7 +4,7 @@ from udkjax.native.language.ir import BOOL, DOUBLE, Function, Value, Variable
 from udkjax.native.module.layout import Lane
 from udkjax.native.watching.conditions import (
     LAST_CHANGE,
-    MIDDLE,
+    MIDDLE_NODE,
     MOST_JUMPS,
     MOST_STUCK,
     RESOLUTION,
@@ -113,7 +113,7 @@ def _refine(module: WatchMemory, f: Function, s: Lane, mask: Value, span: Value,
             s.where(mask, first_t=s.middle_t)
         span = span * (1 / RESOLUTION.finer)
         s.where(mask, share=s.share * (1 / RESOLUTION.finer), which=float(SECOND), stuck=s.stuck + 1.0)
-        s.where(mask, node=f.fma(span, MIDDLE, s.first_t), behind_middle=s.first_t + span)
+        s.where(mask, node=f.fma(span, MIDDLE_NODE, s.first_t), behind_middle=s.first_t + span)
 
 
 def _sign(f: Function, x: Value) -> Value:

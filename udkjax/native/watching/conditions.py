@@ -6,7 +6,7 @@ from itertools import pairwise
 from typing import Any, ClassVar, NamedTuple
 
 from udkjax.expressions import ScalarProgram
-from udkjax.native.module.steps import UNIT
+from udkjax.native.module.steps import ROUNDING_UNIT
 
 
 class Resolution(NamedTuple):
@@ -90,11 +90,11 @@ class Resolution(NamedTuple):
 
 RESOLUTION = Resolution()
 SHORT_PAIR = RESOLUTION.short / 16  # length in T of two of the 32 intervals of such a window
-FINEST = 1e-9  # length of a window, in T, in which changes are no longer resolved
+FINEST_WINDOW = 1e-9  # length of a window, in T, in which changes are no longer resolved
 MOST_JUMPS = 3  # maximum number of jumps before intervals regain their length; more are an oscillation
 # Position of the middle node in two intervals; largest reduction of their length, as a fraction; and the increment of its phase,
 # the golden ratio, so that no oscillation is zero at all nodes.
-MIDDLE, VARIES, TURN = 0.47, 0.2, 0.618
+MIDDLE_NODE, LARGEST_REDUCTION, PHASE_INCREMENT = 0.47, 0.2, 0.618
 MOST_STUCK = 4  # maximum number of successive refinements; before a jump, some finer intervals are resolved
 FIRST, SECOND, THIRD = range(3)  # the next node of two intervals
 LAST_CHANGE = RESOLUTION.late  # largest final correction of the event time, in T
@@ -102,7 +102,8 @@ MOST_AIMS = 12  # maximum number of Newton's steps to a crossing on the polynomi
 MOST_LANDINGS = 5  # maximum number of steps that end at a crossing; usually one
 LEAST_STEP = 10  # shortest step to a crossing, in smallest steps, as the next may be a fifth as long
 WANTED, UNDER_WAY = 1, 2  # states of a landing: a step from the point before the crossing is requested, or has been planned
-ACROSS_BREAK = 8 * UNIT  # longest time, in smallest steps, from the last state before a breakpoint to the first one after it
+# Longest time, in smallest steps, from the last state before a breakpoint to the first one after it.
+ACROSS_BREAK = 8 * ROUNDING_UNIT
 SHORTEST_SPAN = 100  # shortest span, in smallest steps, that is refined
 VARIES_FAST, UNDEFINED = 1.0, 2.0  # faults of intervals: a condition is unresolved, or NaN
 FORCE_STEP = 1e-7  # time difference, in T, for the rate of a force

@@ -6,7 +6,7 @@ the other bound, and bisection replaces steps that leave the bounds.
 
 from udkjax.native.language.ir import DOUBLE, Function, Value
 from udkjax.native.module.layout import Lane
-from udkjax.native.module.steps import POINTS, UNIT, Status
+from udkjax.native.module.steps import NODE_COUNT, ROUNDING_UNIT, Status
 from udkjax.native.watching.conditions import FIRST, LAST_CHANGE, LEAST_STEP, MOST_AIMS, MOST_LANDINGS, UNDER_WAY, WANTED
 from udkjax.native.watching.watch_memory import WatchMemory
 
@@ -29,7 +29,9 @@ def write_locate(module: WatchMemory):
 
     def wide() -> Value:
         middle = (s.low + s.high) * 0.5
-        s.due = f.select((s.seeks > 0.5) & (s.high - s.low > s.smallest * UNIT) & (middle > s.low) & (middle < s.high), one, zero)
+        s.due = f.select(
+            (s.seeks > 0.5) & (s.high - s.low > s.smallest * ROUNDING_UNIT) & (middle > s.low) & (middle < s.high), one, zero
+        )
         return f.any_of(s.due > 0.5)
 
     def zero_ahead() -> Value:
@@ -61,7 +63,8 @@ def write_locate(module: WatchMemory):
         s.where(due & is_beyond, high=s.look)
         s.where(due & ~is_beyond, low=s.look)
         change = s.look - root
-        beyond = f.max(change * change * s.omega, s.smallest * (UNIT * 0.25))  # the error of Newton's step, or a bound's distance
+        # The error of Newton's step, or the distance of a bound.
+        beyond = f.max(change * change * s.omega, s.smallest * (ROUNDING_UNIT * 0.25))
         s.where(due, next_look=f.select(is_beyond, root - beyond, root + beyond), looks=s.looks + 1.0)
     s.look, s.due = s.high, s.seeks
     f.call("look", work)
@@ -83,12 +86,12 @@ def write_approach(module: WatchMemory):
     """Write `approach(work)`: plan a step to `target` from the last point before it, in lanes that are landing."""
     f, s = module.function("approach")
     wanted, zero = s.landing.is_(float(WANTED)), f.const(0.0, DOUBLE, f.width)
-    for k in range(POINTS):  # the latest point before the target
+    for k in range(NODE_COUNT):  # the latest point before the target
         is_before = wanted & (s.target - getattr(s, f"point{k}_t") > s.smallest * LEAST_STEP)
         module.copy_point(f, is_before, f"point{k}", "before")
         s.where(is_before, low=getattr(s, f"point{k}_t"))
         module.stiffness.return_to_point(s, is_before, k)
-    module.copy_point(f, wanted, "before", f"point{POINTS - 1}")
+    module.copy_point(f, wanted, "before", f"point{NODE_COUNT - 1}")
     s.where(wanted, point3_t=s.low, landing=float(UNDER_WAY))
     lands, t1 = s.landing > 0.5, s.point3_t + s.h
     t1 = f.select(t1 > s.target - s.smallest * LEAST_STEP, s.target, t1)
@@ -129,7 +132,7 @@ def write_land(module: WatchMemory):
     change = f.max(change, s.fresh - s.point3_t)  # with a slow condition the corrected time may precede the start
     is_exact = is_complete & is_small
     s.where(is_exact, sure_t=s.point3_t + change)
-    module.move_point(f, is_exact, POINTS - 1, change, ("sure q", "sure v"))
+    module.move_point(f, is_exact, NODE_COUNT - 1, change, ("sure q", "sure v"))
     s.where(is_complete, stops=one)
     module.stop(f, s)
 

@@ -9,15 +9,15 @@ events in Python (`udkjax.integrate`) takes over.
 from typing import Any
 
 from udkjax.native.language.ir import BOOL, DOUBLE, Function, Value
-from udkjax.native.module.layout import INFO, Lane
+from udkjax.native.module.layout import INFO_NAMES, Lane
 from udkjax.native.module.samples import enter_first_row
-from udkjax.native.module.steps import POINTS, Status
+from udkjax.native.module.steps import NODE_COUNT, Status
 from udkjax.native.run.trajectory import Trajectory
 from udkjax.native.watching.passed_events import Passing
 
-COUNTS = ("tried", "accepted", "evaluations", "implicit")  # of all stretches of a run
-KEPT = ("written", "lost", "worst", "turned")  # of a run that begins anew
-ARRAYS = ("sides", "locks", "condition numbers", "condition side", "condition floor", "condition on")  # the same
+COUNT_NAMES = ("tried", "accepted", "evaluations", "implicit")  # of all stretches of a run
+KEPT_FIELDS = ("written", "lost", "worst", "turned")  # of a run that begins anew
+CONDITION_ARRAYS = ("sides", "locks", "condition numbers", "condition side", "condition floor", "condition on")  # the same
 
 
 class PassingRuns(Trajectory):
@@ -37,12 +37,12 @@ class PassingRuns(Trajectory):
         """Reserve memory for the numbers and counts of runs that pass events."""
         if self.passing is None:
             return
-        for name in ("turned", "room", *(f"past {x}" for x in COUNTS)):
+        for name in ("turned", "room", *(f"past {x}" for x in COUNT_NAMES)):
             self.places.add(name)
         self.places.add("sides", self.passing.sides)
         self.places.add("locks", self.passing.locks)
         self.places.add("after v", self.n)
-        for name in ARRAYS:
+        for name in CONDITION_ARRAYS:
             self.places.add(f"kept {name}", self.places_of(name))
         if self.passing.kinks:
             self.passing.kinks.lay_out(self.places)
@@ -52,7 +52,7 @@ class PassingRuns(Trajectory):
             self.places.add("numbers", -(-self.code.number_count // self.plan.width))
 
     def places_of(self, name: str) -> int:
-        """Return the length of the array `name`, one of `ARRAYS`."""
+        """Return the length of the array `name`, one of `CONDITION_ARRAYS`."""
         assert self.passing is not None
         own = {"sides": self.passing.sides, "locks": self.passing.locks, "condition numbers": self.conditions.number_count}
         return own.get(name, self.conditions.count)
@@ -83,7 +83,7 @@ class PassingRuns(Trajectory):
 
     def begin_record(self, f: Function, lane: Value, room: Value):
         """Begin the record of a member with room for `room` events."""
-        for name in ("turned", *(f"past {x}" for x in COUNTS)):
+        for name in ("turned", *(f"past {x}" for x in COUNT_NAMES)):
             self.put_lane_entry(f, name, lane, f.const(0.0))
         self.put_lane_entry(f, "room", lane, room)
 
@@ -96,9 +96,9 @@ class PassingRuns(Trajectory):
         record = self.result_address(f, "passed", member, self._record_length)
         f.store(self.lane_entry(f, "turned", k), record, 0)
         self.copy_lane(f, record, 1, "kept locks", k, count=self.passing.locks)
-        info = self.result_address(f, "info", member, len(INFO) + 2 * self.n)
-        for name in COUNTS:
-            place = INFO.index(name)
+        info = self.result_address(f, "info", member, len(INFO_NAMES) + 2 * self.n)
+        for name in COUNT_NAMES:
+            place = INFO_NAMES.index(name)
             f.store(f.load(info, place) + self.lane_entry(f, f"past {name}", k), info, place)
 
     def enter_start(self, f: Function, lane: Value, member: Value):
@@ -180,26 +180,26 @@ class PassingRuns(Trajectory):
         ts = self.member_address(f, "ts", member)  # the last step may have written outputs after the event
         with f.while_(lambda: (written.value > 0.5) & (f.load(ts, self.to_int(f, written.value)) > t)):
             written.value = written.value - 1.0
-        kept = {name: self.lane_entry(f, name, k) for name in KEPT}
+        kept = {name: self.lane_entry(f, name, k) for name in KEPT_FIELDS}
         kept["written"], kept["turned"] = written.value, kept["turned"] + 1.0
         kept["lost"] = f.select(kept["lost"] > kept["written"], f.const(float("inf")), kept["lost"])
-        for name in COUNTS:
+        for name in COUNT_NAMES:
             kept[f"past {name}"] = self.lane_entry(f, f"past {name}", k) + f.max(self.lane_entry(f, name, k), f.const(0.0))
-        for name in ARRAYS:
+        for name in CONDITION_ARRAYS:
             self._copy_in_lane(f, k, name, f"kept {name}", self.places_of(name))
         f.call("begin", f.given["work"], f.given["call"], k, member)
-        for name in ARRAYS:
+        for name in CONDITION_ARRAYS:
             self._copy_in_lane(f, k, f"kept {name}", name, self.places_of(name))
         self.ask_for_forces(f, k)
         kept["max_steps"] = self.lane_entry(f, "max_steps", k) - kept["past tried"]
-        times = dict.fromkeys(("node", "sure_t", "fresh", "first_t", *(f"point{j}_t" for j in range(POINTS))), t)
+        times = dict.fromkeys(("node", "sure_t", "fresh", "first_t", *(f"point{j}_t" for j in range(NODE_COUNT))), t)
         kept["next"] = f.load(ts, self.to_int(f, kept["written"]) + 1)
         for name, value in (kept | times).items():
             self.put_lane_entry(f, name, k, value)
         with f.each(n) as i:
             for start, x in ((2, "q"), (2 + 2 * n, "v")):  # of the row: q at the event, v after it
                 value = f.load(row, i + start)
-                for to in ("sure", *(f"point{point}" for point in range(POINTS))):
+                for to in ("sure", *(f"point{point}" for point in range(NODE_COUNT))):
                     self.put_lane_entry(f, f"{to} {x}", k, value, i)
         first = self.lane_entry(f, "start", k)
         self.put_lane_entry(f, "start", k, t)

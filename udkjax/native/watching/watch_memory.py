@@ -2,8 +2,8 @@
 
 from udkjax.native.language.ir import DOUBLE, Function, Value
 from udkjax.native.module.layout import Lane, Plan
-from udkjax.native.module.steps import UNIT, Status
-from udkjax.native.watching.conditions import MIDDLE, RESOLUTION, SECOND, TURN, VARIES, Conditions
+from udkjax.native.module.steps import ROUNDING_UNIT, Status
+from udkjax.native.watching.conditions import LARGEST_REDUCTION, MIDDLE_NODE, PHASE_INCREMENT, RESOLUTION, SECOND, Conditions
 from udkjax.native.watching.passed_events import Passing
 from udkjax.native.watching.passing import PassingRuns
 
@@ -141,15 +141,20 @@ class WatchMemory(PassingRuns):
         self.move_conditions(f, mask, g="g0", rate="rate0")
         fastest = self.largest(f, lambda r: [f.abs(self.vector(f, "result v", r)) * self.vector(f, "inverse unit", r)])
         start, rest = s.look, s.end - s.look
-        turn = s.turn + TURN
+        turn = s.turn + PHASE_INCREMENT
         turn = turn - f.intrinsic("floor", turn)
-        span = f.fma(turn, VARIES, 1.0 - VARIES) * (2 / RESOLUTION.per_time) * s.share / f.max(fastest, s.slowest)
+        span = (
+            f.fma(turn, LARGEST_REDUCTION, 1.0 - LARGEST_REDUCTION)
+            * (2 / RESOLUTION.per_time)
+            * s.share
+            / f.max(fastest, s.slowest)
+        )
         # A later refinement needs the points on both sides of the first node: intervals are not longer than the next step, and
         # end with the last one if they begin before it, as after the first steps of a run, whose outputs wait for each other.
         span = f.min(span, f.select(start < s.point2_t, s.point3_t - start, s.h))
         span = f.select(span * 2.0 < rest, span, f.select(span < rest, rest * 0.5, rest))
         inf = f.const(float("inf"), DOUBLE, f.width)
-        goes_on = rest > s.smallest * (4 * UNIT)
-        middle = f.select(goes_on, f.fma(span, MIDDLE, start), inf)
+        goes_on = rest > s.smallest * (4 * ROUNDING_UNIT)
+        middle = f.select(goes_on, f.fma(span, MIDDLE_NODE, start), inf)
         s.where(mask, first_t=start, sure_t=start, turn=turn, which=float(SECOND), node=middle)
         s.where(mask, behind_middle=f.select(span < rest, start + span, s.end))

@@ -13,9 +13,9 @@ continues.
 from udkjax.native.language.ir import BOOL, DOUBLE, INT, Function, Value
 from udkjax.native.language.program import write
 from udkjax.native.module.layout import Lane
-from udkjax.native.module.steps import POINTS, Status
+from udkjax.native.module.steps import NODE_COUNT, Status
 from udkjax.native.watching.condition_intervals import write_classification
-from udkjax.native.watching.conditions import ACROSS_BREAK, FIRST, FORCE_STEP, LAST_CHANGE, MIDDLE, SECOND, THIRD, WANTED
+from udkjax.native.watching.conditions import ACROSS_BREAK, FIRST, FORCE_STEP, LAST_CHANGE, MIDDLE_NODE, SECOND, THIRD, WANTED
 from udkjax.native.watching.locating import write_approach, write_land, write_locate
 from udkjax.native.watching.sliding import write_slide
 from udkjax.native.watching.turning import write_turn
@@ -130,7 +130,7 @@ class Watching(WatchMemory):
             self._accelerate_between(f, s)
         # At a point the polynomial has nothing but its rounding errors, which are largest at the first one, and a condition may
         # begin at zero there.
-        for k in range(POINTS):
+        for k in range(NODE_COUNT):
             ahead = s.look - getattr(s, f"point{k}_t")
             is_point = f.abs(ahead) * s.omega <= LAST_CHANGE
             with f.if_(f.any_of(is_point)):
@@ -144,11 +144,11 @@ class Watching(WatchMemory):
 
     def _accelerate_between(self, f: Function, s: Lane):
         """Compute `node a`, the second derivative of the polynomial at the time `next`."""
-        ahead = [self.broadcast(f, s.next - getattr(s, f"point{POINTS - 1 - k}_t")) for k in range(POINTS)]
+        ahead = [self.broadcast(f, s.next - getattr(s, f"point{NODE_COUNT - 1 - k}_t")) for k in range(NODE_COUNT)]
         with f.each(self.rowcount) as r:
-            q, zero = self.vector(f, f"difference{3 * POINTS - 1}", r), f.const(0.0, DOUBLE, self.plan.vector)
+            q, zero = self.vector(f, f"difference{3 * NODE_COUNT - 1}", r), f.const(0.0, DOUBLE, self.plan.vector)
             v = a = zero
-            for k in reversed(range(3 * POINTS - 1)):
+            for k in reversed(range(3 * NODE_COUNT - 1)):
                 d = ahead[k // 3]
                 a = f.fma(a, d, v * 2.0)
                 v = f.fma(v, d, q)
@@ -170,7 +170,7 @@ class Watching(WatchMemory):
             ends, end = ends | across, f.select(across, s.point3_t, end)
         cut = ends & (s.until >= end) & (s.behind_middle > end) & s.which.is_not(float(FIRST))
         cut = cut & (end - s.first_t > s.smallest * ACROSS_BREAK)
-        node = f.fma(end - s.first_t, MIDDLE, s.first_t)
+        node = f.fma(end - s.first_t, MIDDLE_NODE, s.first_t)
         s.where(cut, which=float(SECOND), node=node, behind_middle=end)
 
     def _write_watch(self):

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import ArrayLike, Float
 
 from udkjax.argument_types import COORDINATES_OF_BODIES
-from udkjax.positions.answers.counting import DRAWN, Count
+from udkjax.positions.answers.counting import DRAWN_TOL, Count
 from udkjax.positions.following.kinematics import Kinematics
 from udkjax.printing import PRINTED_AS_ZERO, PrintedTable, format_number
 from udkjax.requirements import concrete_only
@@ -56,9 +56,9 @@ def instant_centres(
     for k, one in enumerate(names):
         for other in names[k + 1 :]:
             ux, uy, omega = motions[one] - motions[other]
-            if abs(omega) > DRAWN * fastest:
+            if abs(omega) > DRAWN_TOL * fastest:
                 found[one, other] = InstantCentre(np.array([-uy, ux]) / omega, False)
-            elif np.hypot(ux, uy) > DRAWN * speed:
+            elif np.hypot(ux, uy) > DRAWN_TOL * speed:
                 found[one, other] = InstantCentre(np.array([-uy, ux]) / np.hypot(ux, uy), True)
     return found
 
@@ -70,7 +70,7 @@ def centres_table(mechanism: Mechanism, motion: Kinematics, counted: Count) -> P
     finite = [float(np.max(np.abs(place))) for place, at_infinity in centres.values() if not at_infinity]
     largest = max([float(np.max(np.abs(np.asarray(motion.q)[0, :, :2]))), *finite])
     for pair, (place, at_infinity) in centres.items():
-        x, y = (format_number(z / size, scale=DRAWN / PRINTED_AS_ZERO * largest / size) for z in place)
+        x, y = (format_number(z / size, scale=DRAWN_TOL / PRINTED_AS_ZERO * largest / size) for z in place)
         direction = format_number(math.degrees(math.atan2(place[1], place[0])), "deg", 360.0)
         rows.append([" and ".join(pair), *((x, y) if not at_infinity else ("at infinity", direction))])
     return PrintedTable("instant centres", rows, ("links", f"x ({unit})", f"y ({unit})"))

@@ -20,8 +20,9 @@ from udkjax.scene.elements.couplings import Gear
 from udkjax.scene.elements.joints import Cam, Prismatic, Revolute, Slot
 from udkjax.scene.mechanism import Mechanism
 
-ALIKE = 1e-9  # relative to the fastest: speeds of mirrored positions, which rounding separates
-REFINEMENTS, REFINED = 6, 21  # of the extremes of pressure angles: rounds, and values of each; a round divides the step by ten
+SAME_SPEED_TOL = 1e-9  # relative to the fastest: speeds of mirrored positions, which rounding separates
+# Of the extremes of pressure angles: rounds, and values of each; a round divides the step by ten.
+REFINEMENTS, VALUES_PER_ROUND = 6, 21
 
 
 class SpeedRatio(NamedTuple):
@@ -219,7 +220,7 @@ def _speed_ratios(cycle: Cycle, weights: Measured, extremes: list[tuple[float, f
         constant = SpeedRatio(float(cycle.rates(weights)[0]), ())
         return constant, constant
     rates = [rate for _, rate in extremes]
-    same = ALIKE * max(map(abs, rates))
+    same = SAME_SPEED_TOL * max(map(abs, rates))
 
     def reached(best: float) -> SpeedRatio:
         return SpeedRatio(best, tuple(value for value, rate in extremes if abs(rate - best) <= same))
@@ -261,9 +262,9 @@ def _pressure_angles(mechanism: Mechanism, driver: str | Coordinate, cycle: Cycl
             best, step = angles[k], float(np.max(np.diff(values)))
             centre = values[k]
             for _ in range(REFINEMENTS):
-                near = centre + step * np.linspace(-1.0, 1.0, REFINED)
+                near = centre + step * np.linspace(-1.0, 1.0, VALUES_PER_ROUND)
                 around = pressure_angles(mechanism, np.asarray(cycle.at(near).q), name, driver)
-                k, step = int(np.nanargmax(sign * around)), 2 * step / REFINED
+                k, step = int(np.nanargmax(sign * around)), 2 * step / VALUES_PER_ROUND
                 best, centre = sign * max(sign * best, sign * around[k]), near[k]
             ends.append(float(best))
         found[name] = (ends[0], ends[1])

@@ -15,7 +15,7 @@ from udkjax.scene.elements.bodies import GROUND
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.tables.checks import SceneError
 
-DRAWN = 1e-10  # relative to the largest: smaller is rounding of a drawing's numbers, which editors write with twelve digits
+DRAWN_TOL = 1e-10  # relative to the largest: smaller is rounding of a drawing's numbers, which editors write with twelve digits
 
 
 class Count(NamedTuple):

@@ -16,7 +16,7 @@ from udkjax.scene.elements.joints import Revolute
 from udkjax.scene.mechanism import Mechanism
 from udkjax.wording import plural
 
-LINKS = ("ground", "input", "coupler", "output")
+LINK_NAMES = ("ground", "input", "coupler", "output")
 
 
 class FourBarType(NamedTuple):
@@ -128,7 +128,7 @@ def _type_of(at: Pins, loop: Loop, driven: set[str]) -> FourBarType:
     lengths = tuple(float(np.linalg.norm(at[b][body] - at[a][body])) for (body, _), (a, b) in zip(loop, ends, strict=True))
     ordered = sorted(lengths)
     excess = ordered[0] + ordered[3] - ordered[1] - ordered[2]
-    shortest = LINKS[int(np.argmin(lengths))]
+    shortest = LINK_NAMES[int(np.argmin(lengths))]
     kinds = {"ground": "double crank", "input": "crank-rocker", "coupler": "double rocker", "output": "rocker-crank"}
     kind = "change point" if abs(excess) <= ROUNDING * sum(lengths) else "triple rocker" if excess > 0 else kinds[shortest]
     return FourBarType(pins, tuple(body for body, _ in loop), lengths, kind, excess)

@@ -19,7 +19,7 @@ from udkjax.scene.elements.joints import Prismatic, Revolute
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.tables.checks import SceneError
 
-ALL_ROUND = FULL_TURN * (1 - 1e-9)  # (rad) a link with a larger swing makes full turns; the margin is for rounding
+FULL_SWING = FULL_TURN * (1 - 1e-9)  # (rad) a link with a larger swing makes full turns; the margin is for rounding
 
 
 class MotionRanges(PrintsTable):
@@ -92,7 +92,7 @@ def range_lines(found: MotionRanges) -> dict[str, str]:
         for ranges in (found.swings, found.strokes, found.transmission_angles)
     )
     lines = {
-        name: "turns all the way round" if x > ALL_ROUND else f"turns by {np.degrees(x):.4g} deg" for name, x in swings.items()
+        name: "turns all the way round" if x > FULL_SWING else f"turns by {np.degrees(x):.4g} deg" for name, x in swings.items()
     }
     lines |= {name: f"slides by {x:.4g} m" for name, x in strokes.items()}
     for name, (least, largest) in angles.items():

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from udkjax.annotations import NumberLike
 from udkjax.argument_types import HISTORY, NUMBERS_BY_NAME, ArgumentRequirement
 from udkjax.arrays import by_numpy, library_for
-from udkjax.positions.answers.counting import DRAWN, Count
+from udkjax.positions.answers.counting import DRAWN_TOL, Count
 from udkjax.positions.assembling.channels import pins_of, point_of_pin
 from udkjax.positions.assembling.coordinates import value_of
 from udkjax.positions.following.drive import Drive, constant_speed, only_driver
@@ -71,7 +71,7 @@ class PinMotion(PrintsTable):
         motions = {name: np.asarray(motion) / count.units.size("m") for name, motion in self.pins.items()}
         usual, turning = self._usual(count.is_angle)
         largest = [max([usual[k], *(float(np.nanmax(np.abs(x[:, k]), initial=0.0)) for x in motions.values())]) for k in range(3)]
-        pin_rows = {name: [_pin_row(x, [DRAWN * y for y in largest]) for x in motion] for name, motion in motions.items()}
+        pin_rows = {name: [_pin_row(x, [DRAWN_TOL * y for y in largest]) for x in motion] for name, motion in motions.items()}
         link_rows: dict[str, np.ndarray] = {name: np.asarray(motion) * scale for name, motion in self.links.items()}
         if len(self.values) == 1:  # over several values, angles are continuous
             for rows in link_rows.values():
@@ -123,7 +123,7 @@ class PinMotion(PrintsTable):
         sizes = np.abs(np.array([row for motion in rows.values() for row in motion]).reshape(-1, len(heads) - 1))
         largest = np.maximum(np.max(sizes, axis=0, initial=0.0, where=np.isfinite(sizes)), usual[: len(heads) - 1])
         scales = [
-            360.0 if "deg" in head else None if "ratio" in head else DRAWN / PRINTED_AS_ZERO * x
+            360.0 if "deg" in head else None if "ratio" in head else DRAWN_TOL / PRINTED_AS_ZERO * x
             for head, x in zip(heads[1:], largest, strict=True)
         ]
         cells = [
@@ -150,8 +150,8 @@ def _ratio(rate: np.ndarray, motion: np.ndarray) -> np.ndarray:
     `motion` has the link's angle, angular velocity and angular acceleration, (T, 3).
     """
     omega, alpha = motion[:, 1], motion[:, 2]
-    still = np.abs(omega) <= DRAWN * np.abs(rate)
-    never = np.all(still & (np.abs(alpha) <= DRAWN * rate**2))
+    still = np.abs(omega) <= DRAWN_TOL * np.abs(rate)
+    never = np.all(still & (np.abs(alpha) <= DRAWN_TOL * rate**2))
     return np.full_like(omega, np.nan) if never else np.where(still, np.inf, rate / np.where(still, 1.0, omega))
 
 

@@ -22,7 +22,7 @@ from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.tables.checks import SceneError
 from udkjax.wording import quote
 
-RANK = 1e3 * ROUNDING  # relative to the largest singular value: motions with less are free
+FREE_MOTION_TOL = 1e3 * ROUNDING  # relative to the largest singular value: motions with less are free
 
 
 @checked
@@ -99,5 +99,5 @@ def _slope(mechanism: Mechanism, driver: str | Coordinate, q: Float[Array, "bodi
 def _null_vectors(rows: Float[np.ndarray, "T rows n"]) -> Float[np.ndarray, "T n"]:
     """Return the null vector of each of T Jacobians whose null space has dimension one; NaN for the others."""
     values, vectors = np.linalg.svd(rows)[1:]
-    free = rows.shape[2] - np.sum(values > RANK * values[:, :1], axis=1)
+    free = rows.shape[2] - np.sum(values > FREE_MOTION_TOL * values[:, :1], axis=1)
     return np.where(free[:, None] == 1, vectors[:, -1], np.nan)

@@ -13,11 +13,11 @@ from udkjax.positions.following.kinematics import Kinematics, kinematics
 from udkjax.positions.following.travel import travel
 from udkjax.scene.mechanism import Mechanism
 
-GRID = 721  # values of a driver over its range: half a degree apart over a turn
-SHIFT = 0.4142  # of a step: linkages are drawn in dead points, which shall lie within the range
-STILL = 1e-9  # relative to the fastest: slower is rounding
+GRID_VALUES = 721  # values of a driver over its range: half a degree apart over a turn
+GRID_SHIFT = 0.4142  # of a step: linkages are drawn in dead points, which shall lie within the range
+STILL_TOL = 1e-9  # relative to the fastest: slower is rounding
 NEWTON_STEPS = 5  # from a secant of the grid to rounding
-SECANTS = 7  # the same without the derivative, by secants that keep the zero between them
+SECANT_STEPS = 7  # the same without the derivative, by secants that keep the zero between them
 
 
 Item = TypeVar("Item")
@@ -114,9 +114,9 @@ class Cycle:
         self.ends = [(v, np.asarray(q)) for v, q in ((lower, limits.lower_q), (upper, limits.upper_q)) if np.isfinite(v)]
         self.is_known = self.turns or len(self.ends) == 2
         if self.turns:
-            values = start + SHIFT * FULL_TURN / (GRID - 1) + np.linspace(0.0, FULL_TURN, GRID)
+            values = start + GRID_SHIFT * FULL_TURN / (GRID_VALUES - 1) + np.linspace(0.0, FULL_TURN, GRID_VALUES)
         else:  # closer towards the toggles, where positions change with the root of the distance
-            shares = 0.5 - 0.5 * np.cos(np.pi * np.arange(1, GRID) / GRID)
+            shares = 0.5 - 0.5 * np.cos(np.pi * np.arange(1, GRID_VALUES) / GRID_VALUES)
             values = lower + (upper - lower) * shares
         self.values, self.q, self.dq, self.ddq = self._parts(self.at(values)) if self.is_known else (np.zeros(0),) * 4
 
@@ -140,7 +140,7 @@ class Cycle:
         first, last = slopes[which, index], slopes[which, index + 1]
         value = low - first * (high - low) / (last - first)
         height, dwells = np.zeros(len(value)), np.zeros(len(value), bool)
-        largest = STILL * np.max(np.abs(slopes), axis=1)[which]
+        largest = STILL_TOL * np.max(np.abs(slopes), axis=1)[which]
         for _ in range(NEWTON_STEPS):
             order = np.argsort(value)
             motion = self.at(value[order])
@@ -169,7 +169,7 @@ class Cycle:
         which, index = np.array(found).T
         ends, heights = self.values[np.stack([index, index + 1])], np.stack(curves)[which, np.stack([index, index + 1])]
         value, rate, kept = ends[0], np.zeros(len(found)), np.full(len(found), -1)
-        for _ in range(SECANTS):
+        for _ in range(SECANT_STEPS):
             value = ends[0] - heights[0] * (ends[1] - ends[0]) / (heights[1] - heights[0])
             order = np.argsort(value)
             motion, back = self.at(value[order]), np.argsort(order)
@@ -216,7 +216,7 @@ def _sign_changes(slopes: np.ndarray, size: float = 0.0) -> list[int]:
     most one change.
     """
     signs = np.sign(slopes)
-    signs[np.abs(slopes) <= STILL * max(size, np.max(np.abs(slopes), initial=0.0))] = 0.0
+    signs[np.abs(slopes) <= STILL_TOL * max(size, np.max(np.abs(slopes), initial=0.0))] = 0.0
     last = np.maximum.accumulate(np.where(signs != 0.0, np.arange(len(signs)), 0))
     signs = signs[last]
     return np.flatnonzero(signs[:-1] * signs[1:] < 0.0).tolist()

@@ -59,7 +59,7 @@ def measure(
     columns = [c.function(mechanism, filled) if isinstance(c, Quantity) else _MEASURES[c.section](c, motion) for c in channels]
     if not columns:
         return jnp.zeros((len(motion.q), 0))
-    valid = [placed if isinstance(c, Channel) and c.quantity in POSITIONS else reached for c in channels]
+    valid = [placed if isinstance(c, Channel) and c.quantity in POSITION_QUANTITIES else reached for c in channels]
     return jnp.where(jnp.stack(valid, -1), jnp.stack(columns, -1), jnp.nan)
 
 
@@ -127,8 +127,8 @@ def _fill(
     return _Motion(mechanism, solution.ts if scene is None else scene.ts, q, v, a, scene), placed, reached
 
 
-POSITIONS = ("x", "y", "angle", "distance")  # quantities that do not depend on velocities
-DERIVATIVE = {"": 0, "v": 1, "a": 2}  # order of the derivative of a position, by the letter before x or y
+POSITION_QUANTITIES = ("x", "y", "angle", "distance")  # quantities that do not depend on velocities
+DERIVATIVE_ORDER = {"": 0, "v": 1, "a": 2}  # order of the derivative of a position, by the letter before x or y
 
 
 class _Dynamics(NamedTuple):
@@ -233,7 +233,7 @@ def _measure_body(channel: Channel, motion: _Motion) -> Array:
 
 def _component(motion: _Motion, body: str, point: Float[Array, "2"] | tuple[float, float], quantity: str) -> Array:
     """Return x or y of the position, velocity or acceleration of a point of a body; `quantity` is x, y, vx, vy, ax or ay."""
-    values = motion.point(body, point, DERIVATIVE[quantity[:-1]])
+    values = motion.point(body, point, DERIVATIVE_ORDER[quantity[:-1]])
     return jnp.broadcast_to(getattr(values, quantity[-1]), motion.ts.shape)
 
 

@@ -24,7 +24,7 @@ from udkjax.scene.tables.checks import SceneError
 from udkjax.wording import free_name, quote, suggestion
 
 CoordinateName = Literal["angle", "x", "y", "distance"]
-DRIVEN = get_args(CoordinateName)
+COORDINATE_NAMES = get_args(CoordinateName)
 
 
 def _names_of_bodies(value: Any) -> tuple[str, ...]:
@@ -52,7 +52,7 @@ class Coordinate(PrintsLine):
     axis: Float[Array, ""] | None = eqx.field(converter=number_called("axis", optional=True), default=None)
 
     def __check_init__(self):
-        require_choice("coordinate", self.coordinate, DRIVEN)
+        require_choice("coordinate", self.coordinate, COORDINATE_NAMES)
 
     @classmethod
     def of(cls, driver: Driver) -> "Coordinate":
@@ -124,7 +124,7 @@ def coordinate_of(mechanism: Mechanism, text: str) -> Coordinate:
         drivers = ", ".join(map(quote, mechanism.driver_names)) or "none"
         cure = suggestion(text, mechanism.driver_names) or f"; drivers: {drivers}; coordinates: body.NAME.angle, joint.NAME.angle"
         raise SceneError([f"{quote(text)} is neither a driver nor a coordinate: {problem}{cure}"], mechanism.name) from None
-    if channel.quantity not in DRIVEN:
+    if channel.quantity not in COORDINATE_NAMES:
         raise SceneError([f"{quote(text)} cannot be driven: name an angle, x, y or a distance"], mechanism.name)
     kind = cast(CoordinateName, channel.quantity)
     with jax.ensure_compile_time_eval():

@@ -12,7 +12,7 @@ from udkjax.annotations import NumberLike
 from udkjax.arrays import library_for
 from udkjax.equations.rows.analysis import Analysis, analyse
 from udkjax.positions.assembling.assembly import State, close
-from udkjax.positions.following.branches import SAME_POSITION
+from udkjax.positions.following.branches import SAME_POSITION_TOL
 from udkjax.positions.following.continuation import Points, Reached, follow, no_points
 from udkjax.positions.following.curve import AbstractCurve, Curve, NumpyCurve
 from udkjax.positions.following.drive import Drive, Driven, drive
@@ -99,7 +99,7 @@ def _count_on_branch(
         s, q = (values[k - 1], march_result.q[k - 1]) if k else (s, q)
         reached = follow(curve, s, q, values[k : k + 1], no_points(1, len(q), np), 0)
         distance = np.abs(reached.q[0] - march_result.q[k]) / curve.units[:-1]
-        if not (Reached.has_position(reached.status[0]) and np.max(distance) <= SAME_POSITION):
+        if not (Reached.has_position(reached.status[0]) and np.max(distance) <= SAME_POSITION_TOL):
             return k
     return trusted
 

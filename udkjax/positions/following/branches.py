@@ -71,7 +71,7 @@ def _close(
     return jax.vmap(close_one)(guesses)
 
 
-SAME_POSITION = 1e-5  # tolerance, relative to the characteristic length or in rad, within which positions are the same
+SAME_POSITION_TOL = 1e-5  # tolerance, relative to the characteristic length or in rad, within which positions are the same
 
 
 def random_positions(mechanism: Mechanism, count: int, seed: int, state: State | None = None) -> Float[Array, "count bodies 3"]:
@@ -96,6 +96,6 @@ def distinct_positions(q: Float[Array, "count bodies 3"], valid: Bool[Array, "co
         d = points[k] - points[different]
         d[..., 2] = 2 * np.abs(np.sin(d[..., 2] / 2))
         d[..., :2] /= length
-        if not different or np.min(np.max(np.abs(d), axis=(1, 2))) > SAME_POSITION:
+        if not different or np.min(np.max(np.abs(d), axis=(1, 2))) > SAME_POSITION_TOL:
             different.append(int(k))
     return different

@@ -39,7 +39,7 @@ LARGEST_BEND = 0.95  # cosine of the largest turn of the tangent in a step, 18 d
 PREDICTION_TOL = 0.3  # largest distance of a step's end from the prediction, relative to the step
 MAX_SECANTS = 60  # largest number of secant steps to a root; ten are usual
 MAX_TRIALS = 2000  # extra steps between requested values: enough for some hundred turns
-AT_TOGGLE = 8.0  # tolerance, in units of rounding, within which a value equals that of a toggle
+TOGGLE_TOL = 8.0  # tolerance, in units of rounding, within which a value equals that of a toggle
 
 T = TypeVar("T")
 
@@ -292,7 +292,7 @@ def _narrow(
 
     at = curve.by.cond(ended & ~for_value & (clearance < NEAR_LOSS), across, lambda: at)
     # The toggle is found: the target is beyond it, equal up to rounding, or before it.
-    tolerance = AT_TOGGLE * float(np.finfo(at.dtype).eps) * xp.maximum(1.0, xp.abs(at[-1]))
+    tolerance = TOGGLE_TOL * float(np.finfo(at.dtype).eps) * xp.maximum(1.0, xp.abs(at[-1]))
     distance = (target - at[-1]) * way
     x, points = at * curve.units, state.points
     beyond = points._replace(limit=x[-1], limit_q=x[:-1])

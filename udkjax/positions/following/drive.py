@@ -33,7 +33,7 @@ from udkjax.scene.tables.checks import SceneError
 from udkjax.scene.tables.position_only import refuse_rolling
 from udkjax.wording import join_names, quote
 
-MOVES = 1e-6  # relative to the longest free direction, in the metric of the links' arms and radians; less is rounding
+MOTION_TOL = 1e-6  # relative to the longest free direction, in the metric of the links' arms and radians; less is rounding
 Drive = str | Coordinate | None  # the name of a driver or coordinate, a coordinate; None: all drivers along time
 
 
@@ -253,8 +253,8 @@ def _require_determinate(mechanism: Mechanism, analysis: Analysis, driven: str) 
 def free_motion(mechanism: Mechanism) -> dict[str, Bool[np.ndarray, "3"]]:
     """Return for each body a mask of the coordinates x, y, angle that can move at the initial guess."""
     rows = KinematicRows(mechanism)
-    free = null_space(rows.at(0.0, np.ravel(mechanism.q0))[2], MOVES)
-    moves = np.linalg.norm(free, axis=0).reshape(-1, 3) > MOVES
+    free = null_space(rows.at(0.0, np.ravel(mechanism.q0))[2], MOTION_TOL)
+    moves = np.linalg.norm(free, axis=0).reshape(-1, 3) > MOTION_TOL
     return dict(zip(mechanism.body_names, moves, strict=True))
 
 

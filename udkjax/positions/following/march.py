@@ -22,7 +22,7 @@ from udkjax.scene.elements.held import row_size, with_row
 from udkjax.scene.mechanism import Mechanism
 
 MOST_KNOTS = 100  # largest number of knots of spline motions: compiling their programs takes 10 ms per knot
-DEPENDENT = 1e-10  # remainder of a dependent row, relative to its square; a march ends long before
+DEPENDENT_ROW_TOL = 1e-10  # remainder of a dependent row, relative to its square; a march ends long before
 
 
 class MarchResult(NamedTuple):
@@ -94,7 +94,7 @@ class _Prepared(NamedTuple):
 def _numbers(mechanism: Mechanism, analysis: Analysis) -> _Prepared:
     numbers = _of_unit_masses(_without_loads(mechanism), analysis.scales.length).numbers
     operation = _operation(mechanism, analysis)
-    return _Prepared(operation, [*numbers, DEPENDENT, 0.0], _calls(operation))
+    return _Prepared(operation, [*numbers, DEPENDENT_ROW_TOL, 0.0], _calls(operation))
 
 
 @cached_by_identity
@@ -109,7 +109,7 @@ def _numbers_of_concrete(mechanism: Mechanism, analysis: Analysis) -> tuple[_Pre
     numbers = np.concatenate([np.ravel(x) for x in scene.numbers])
     programs = scene_programs(scene, analysis.redundant_rows or (), in_pieces=False)
     numbers = programs.with_unit_masses(numbers, float(analysis.scales.length))
-    return _Prepared(operation, [np.append(numbers, [DEPENDENT, 0.0])], _calls(operation)), analysis
+    return _Prepared(operation, [np.append(numbers, [DEPENDENT_ROW_TOL, 0.0])], _calls(operation)), analysis
 
 
 def _inputs(

@@ -35,7 +35,7 @@ from udkjax.programs.varying_axes import result_type
 from udkjax.transforms.gradients import stop_gradients
 
 # Bound on residues, relative to the largest (s - s*) dq/dp: smaller ones are rounding errors, amplified by E^+ up to 100 times.
-RESIDUE = 1e-6
+RESIDUE_TOL = 1e-6
 # Largest number of meetings in one call; at further ones, derivatives with respect to numbers of the constraints are NaN.
 MOST_MEETINGS = 8
 
@@ -148,7 +148,7 @@ def _at_meetings(curve: Curve, values: Array, found: Three, spacing: Array, acti
     changes = jax.jacfwd(moved)(numbers)  # (K, 12, n, P) each
     ends = offset[:, :, None, None] * changes[0]
     size, residue = jnp.max(jnp.abs(ends), (1, 2)), jnp.einsum("j,kjnp->kpn", weights(FARTHEST_NODE), ends)
-    residue = jnp.where(jnp.abs(residue) > RESIDUE * size[..., None], residue, 0.0)
+    residue = jnp.where(jnp.abs(residue) > RESIDUE_TOL * size[..., None], residue, 0.0)
     smooth = jnp.stack([jnp.einsum("j,kjnp->knp", weights(FARTHEST_NODE), x) / unit**k for k, x in enumerate(changes)], 1)
     usable = jnp.all(is_closed, 1) & (spacing > 0)
     return jnp.where(usable[:, None, None, None], smooth * W[:, None], jnp.nan), residue
@@ -172,7 +172,7 @@ def _apply(operator: _Operator, vector: Array) -> Array:
         return jnp.where(separates, jnp.nan, cotangent)
     used = jnp.where(vector != 0, matrix, 0.0)
     total, terms = (jnp.einsum("kpn,p->kn", x, y) for x, y in ((residue, vector), (jnp.abs(residue), jnp.abs(vector))))
-    separates = jnp.any(jnp.abs(total) > RESIDUE * jnp.max(terms, 1, keepdims=True), 1)
+    separates = jnp.any(jnp.abs(total) > RESIDUE_TOL * jnp.max(terms, 1, keepdims=True), 1)
     return jnp.where(separates[:, None, None], jnp.nan, jnp.einsum("kinp,p->kin", used, vector)).ravel()
 
 

@@ -15,7 +15,7 @@ from udkjax.arrays import FULL_TURN
 from udkjax.positions.assembling.assembly import State, assemble
 from udkjax.positions.assembling.coordinates import element_of
 from udkjax.positions.following.branch_positions import solve_on_branch, start_on_branch
-from udkjax.positions.following.branches import SAME_POSITION
+from udkjax.positions.following.branches import SAME_POSITION_TOL
 from udkjax.positions.following.carried_bodies import carried_bodies
 from udkjax.positions.following.continuation import Points, Reached
 from udkjax.positions.following.drive import Drive, Driven
@@ -132,4 +132,4 @@ def _returns(driven: Driven, q: Any, points: Points) -> bool:
         return False
     moved = (points.q[0] - q) / driven.analysis.scales.coordinates(len(q))
     moved[2::3] -= 2 * np.pi * np.round(moved[2::3] / (2 * np.pi))
-    return bool(np.max(np.abs(moved)) <= SAME_POSITION)
+    return bool(np.max(np.abs(moved)) <= SAME_POSITION_TOL)

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from udkjax.positions.gaps.convex import Feature
-from udkjax.positions.gaps.motion_tables import ORDERS
+from udkjax.positions.gaps.motion_tables import DERIVATIVE_ORDERS
 
 
 class Moving(NamedTuple):
@@ -67,7 +67,7 @@ class MovingPart(NamedTuple):
 
 def _fourth_of_product(one: Any, other: Any) -> Any:
     """Return bounds of the fourth derivatives of scalar products, from bounds of vectors and of derivatives (1 + orders, n)."""
-    return sum(comb(ORDERS, k) * one[k] * other[ORDERS - k] for k in range(ORDERS + 1))
+    return sum(comb(DERIVATIVE_ORDERS, k) * one[k] * other[DERIVATIVE_ORDERS - k] for k in range(DERIVATIVE_ORDERS + 1))
 
 
 def least_of_cubics(f: Moving, h: Any) -> tuple[Any, Any]:

@@ -24,9 +24,9 @@ from udkjax.positions.gaps.search import Least
 from udkjax.positions.gaps.shapes import ConvexPart
 from udkjax.programs.deferred import deferred
 
-SINGULAR = 1e-9  # of the largest singular value of the Jacobian: redundant rows, and gaps that are constant along a motion
-STEPS = 3  # of Newton's method to the concrete pose, from the polynomials' rounding
-CHORDS = 2  # with the Jacobian there: each makes one more order of the derivatives right
+SINGULAR_TOL = 1e-9  # of the largest singular value of the Jacobian: redundant rows, and gaps that are constant along a motion
+NEWTON_STEPS = 3  # of Newton's method to the concrete pose, from the polynomials' rounding
+CHORD_STEPS = 2  # with the Jacobian there: each makes one more order of the derivatives right
 
 
 class DrivenPoses(NamedTuple):
@@ -146,9 +146,9 @@ def _moved(kind: str, place: PosesNear, pair: ClosestPair, z: np.ndarray, v: np.
         way = np.ravel(v) / np.asarray(given[0].curve.units)[:-1]
         more = way / np.linalg.norm(way)
     y, fixed, plus = np.append(z, more), (z, more), np.zeros((0, 0))
-    for _ in range(STEPS):
+    for _ in range(NEWTON_STEPS):
         F, J = map(np.asarray, _equations_at(kind, *given, fixed, y))
-        plus = np.linalg.pinv(J, rcond=SINGULAR)
+        plus = np.linalg.pinv(J, rcond=SINGULAR_TOL)
         y = y - plus @ F
     found = _gap_by_chords(kind, place, pair, fixed, y, plus)
     return distance + (found - jax.lax.stop_gradient(found))
@@ -190,7 +190,7 @@ def _equations_at(kind: str, *given: Any) -> tuple[Array, Array]:
 @deferred
 def _gap_by_chords(kind: str, place: PosesNear, pair: ClosestPair, fixed: Any, y: Any, plus: Any) -> Array:
     step = lambda y, _: (y - plus @ _equations(kind, place, pair, fixed, y), None)  # noqa: E731
-    y = jax.lax.scan(step, y, length=CHORDS)[0]
+    y = jax.lax.scan(step, y, length=CHORD_STEPS)[0]
     return pair.gap(place.q(y[: len(fixed[0])]))
 
 

@@ -21,7 +21,8 @@ from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.tables.checks import SceneError
 
 FIRST_POSES = 361  # of a drive: a degree apart over a turn
-FOLLOWED = 1e-11  # of the mechanism's size: error of a polynomial halfway between poses, above which a pose is computed there
+# Of the mechanism's size: error of a polynomial halfway between poses, above which a pose is computed there.
+POLYNOMIAL_TOL = 1e-11
 MOST_HALVINGS = 8
 PosesAndRates = Float[np.ndarray, "n 3 bodies 3"]  # positions of bodies and, last, of the ground, with two derivatives by u
 
@@ -163,7 +164,7 @@ def _follow(
         between = sample(middle)
         off = (np.abs(motion.at(middle, check)[0] - between[:, 0]).max(1) / size).max(1)
         u, x = np.insert(u, check + 1, middle), np.insert(x, check + 1, between, axis=0)
-        far = np.flatnonzero(off > 64 * FOLLOWED)  # half the length has 1/64 of the error
+        far = np.flatnonzero(off > 64 * POLYNOMIAL_TOL)  # half the length has 1/64 of the error
         check = np.sort(np.concatenate([check[far] + far, check[far] + far + 1]))
     if not motion.known.any():
         raise ValueError("no two neighbouring values of the driver are reached")

@@ -5,7 +5,7 @@ from jaxtyping import Float, Int
 
 from udkjax.positions.gaps.motion import PolynomialMotion, de_casteljau
 
-ORDERS = 4  # of derivatives
+DERIVATIVE_ORDERS = 4  # of derivatives
 
 
 class MotionTables:
@@ -41,14 +41,17 @@ class MotionTables:
         ends = controls[:: len(controls) - 1, :2] if known.all() else controls[:: len(controls) - 1, :2, :, known]
         self.lowest, self.highest = ends.min((0, -1)), ends.max((0, -1))
         share = 1.0 / np.where(known, self.steps, np.inf)
-        largest, stage = np.zeros((2, ORDERS, *controls.shape[2:])), controls
-        for k in range(min(ORDERS, len(controls) - 1)):
+        largest, stage = np.zeros((2, DERIVATIVE_ORDERS, *controls.shape[2:])), controls
+        for k in range(min(DERIVATIVE_ORDERS, len(controls) - 1)):
             stage = (stage[1:] - stage[:-1]) * ((len(stage) - 1) * share)
             largest[0, k] = np.sqrt((stage[:, 0] * stage[:, 0] + stage[:, 1] * stage[:, 1]).max(0))
             largest[1, k] = np.abs(stage[:, 2]).max(0)
         if not known.all():
             largest = np.where(known, largest, 0.0)
-        self.places, self.directions = largest[0].reshape(ORDERS, -1), turning(largest[1].reshape(ORDERS, -1))
+        self.places, self.directions = (
+            largest[0].reshape(DERIVATIVE_ORDERS, -1),
+            turning(largest[1].reshape(DERIVATIVE_ORDERS, -1)),
+        )
         self._over = {1: np.stack([self.places[:2], self.directions[:2]])}
 
     def over(self, count: int) -> Float[np.ndarray, "2 2 pieces"]:

@@ -13,7 +13,8 @@ from udkjax.scene.tables.checks import SceneError
 from udkjax.wording import join_names, quote, suggestion
 
 LinkPair = tuple[str, str]
-SAME_PIN = 1e-9  # of the largest coordinate of a pin: two revolutes of a body nearer than this are at one place, up to rounding
+# Of the largest coordinate of a pin: two revolutes of a body nearer than this are at one place, up to rounding.
+SAME_PIN_TOL = 1e-9
 
 
 def joined_pairs(mechanism: Mechanism) -> dict[LinkPair, str]:
@@ -34,7 +35,7 @@ def joined_pairs(mechanism: Mechanism) -> dict[LinkPair, str]:
     size = max((float(np.abs(place).max()) for at in pins.values() for place, _, _ in at), default=0.0)
     for at in pins.values():
         for (place, one, name), (there, other, _) in combinations(at, 2):
-            if one != other and np.hypot(*(place - there)) <= SAME_PIN * size:
+            if one != other and np.hypot(*(place - there)) <= SAME_PIN_TOL * size:
                 found.setdefault((one, other), name)
                 found.setdefault((other, one), name)
     return found

@@ -21,16 +21,17 @@ from udkjax.positions.gaps.motion_tables import MotionTables
 from udkjax.positions.gaps.part_pairs import ClosestPlaces, PartPairs, PlacedFrames, part_pairs
 from udkjax.positions.gaps.shapes import ConvexPart
 
-PROVEN = 1e-10  # of the size of the mechanism: how far below the least gap found another one might be
-OPENED = 1e-6  # of the size: smaller openings within a stretch of contact may be passed over
-SPLITS = 4  # parts into which an interval is split; it decides only the time: for bars 2 takes a fifth longer, 8 a tenth less
-BLOCK = SPLITS**2  # polynomials of a motion in the first intervals
+PROVEN_TOL = 1e-10  # of the size of the mechanism: how far below the least gap found another one might be
+OPENING_TOL = 1e-6  # of the size: smaller openings within a stretch of contact may be passed over
+# Parts into which an interval is split; it decides only the time: for bars 2 takes a fifth longer, 8 a tenth less.
+SPLIT_PARTS = 4
+BLOCK_PIECES = SPLIT_PARTS**2  # polynomials of a motion in the first intervals
 MOST_INTERVALS = 100_000  # at a time; beyond that, the bound that is proven is returned
 MOST_NUMBERS = 20_000  # of an array of pairs of corners at places measured at a time; more are no faster, a quarter is slower
-BESIDE = 1e-6  # of a piece, from a least gap: where both sides of a kink are seen
+KINK_OFFSET = 1e-6  # of a piece, from a least gap: where both sides of a kink are seen
 MOST_STEPS = 100  # to a root
 LAST_STEP = 1e-12  # to it, of a piece
-STEEP = 1e-2  # of the values at the ends: a smaller one, not at a jump, allows a last step 1 / STEEP as long
+STEEP_FRACTION = 1e-2  # of the values at the ends: a smaller one, not at a jump, allows a last step 1 / STEEP_FRACTION as long
 Stretches = list[tuple[float, float]]
 
 
@@ -137,25 +138,25 @@ class PairSearch:
         Args:
             least: the least gap found of each pair of links, which is updated in place.
         """
-        left, step = self._first_intervals(least), float(BLOCK)
+        left, step = self._first_intervals(least), float(BLOCK_PIECES)
         while 0 < len(left.k) <= MOST_INTERVALS:
-            step /= SPLITS
-            rows, found = max(1, self.points // (SPLITS + 1)), []
+            step /= SPLIT_PARTS
+            rows, found = max(1, self.points // (SPLIT_PARTS + 1)), []
             for first in range(0, len(left.k), rows):
                 k, s0, s1 = (x[first : first + rows, None] for x in left[:3])
-                s = np.minimum(s0 + step * np.arange(SPLITS + 1), s1).ravel()
-                k = np.broadcast_to(k, (len(k), SPLITS + 1)).ravel()
+                s = np.minimum(s0 + step * np.arange(SPLIT_PARTS + 1), s1).ravel()
+                k = np.broadcast_to(k, (len(k), SPLIT_PARTS + 1)).ravel()
                 kept = np.append(True, (s[1:] != s[:-1]) | (k[1:] != k[:-1]))
-                inside = (np.arange(len(k)) % (SPLITS + 1) > 0)[kept][1:]
+                inside = (np.arange(len(k)) % (SPLIT_PARTS + 1) > 0)[kept][1:]
                 k, s = k[kept], s[kept]
                 found.append(self._open(k, s, self._frames(k, s), inside, step, least)[0])
             left = Intervals.joined(found)
         self._finish(left)
 
     def _first_intervals(self, least: Float[np.ndarray, "owners"]) -> Intervals:
-        """Evaluate intervals of `BLOCK` pieces, and return those that must be split; set `touching_at_ends`."""
+        """Evaluate intervals of `BLOCK_PIECES` pieces, and return those that must be split; set `touching_at_ends`."""
         motion, count = self.motion, len(self.least)
-        blocks = [np.append(np.arange(*ends, BLOCK), ends[1]) for ends in zip(motion.starts, motion.ends, strict=True)]
+        blocks = [np.append(np.arange(*ends, BLOCK_PIECES), ends[1]) for ends in zip(motion.starts, motion.ends, strict=True)]
         s, last = np.concatenate(blocks).astype(float), np.cumsum([len(x) for x in blocks]) - 1
         first, inside = np.append(0, last[:-1] + 1), np.ones(len(s), bool)
         inside[last] = False
@@ -167,7 +168,7 @@ class PairSearch:
             some = np.arange(start, min(start + size, count))
             at = ((rows[:, some] * len(s))[..., None] + np.arange(len(s))).reshape(2, -1)
             k, places, within = np.repeat(some, len(s)), np.tile(s, len(some)), np.tile(inside, len(some))[:-1]
-            intervals, gaps = self._open(k, places, [frames.take(x) for x in at], within, float(BLOCK), least)
+            intervals, gaps = self._open(k, places, [frames.take(x) for x in at], within, float(BLOCK_PIECES), least)
             found.append(intervals)
             touching.append(gaps.reshape(-1, len(s)) < 0)
         self.touching_at_ends = [np.concatenate([x[:, ends] for x in touching]) for ends in (first, last)]
@@ -246,7 +247,7 @@ class PairSearch:
         self, k: np.ndarray, low: np.ndarray, high: np.ndarray, d0: np.ndarray, d1: np.ndarray, least: np.ndarray
     ) -> Bool[np.ndarray, "n"]:
         """Return a mask of the intervals in which a gap may be below the least one, or a change of its sign is not isolated."""
-        slack, opened = PROVEN * self.size, OPENED * self.size
+        slack, opened = PROVEN_TOL * self.size, OPENING_TOL * self.size
         hides = ((low < -slack) & (np.minimum(d0, d1) > 0)) | ((high > opened) & (np.maximum(d0, d1) < 0))
         crosses = ((d0 < 0) != (d1 < 0)) & (high - low > opened)
         return (low < least[self.pairs.owner[k]] - slack) | hides | crosses
@@ -281,7 +282,7 @@ class PairSearch:
         root[inner] = _roots(lambda x, i: self.closest_places(k[inner[i]], x).rate, *(x[inner] for x in (low, high, *slopes, s)))
 
         def around(i: np.ndarray, s: np.ndarray) -> list[ClosestPlaces]:
-            places = np.maximum(s - BESIDE, low[i]), s, np.minimum(s + BESIDE, high[i])
+            places = np.maximum(s - KINK_OFFSET, low[i]), s, np.minimum(s + KINK_OFFSET, high[i])
             at = self.closest_places(np.tile(k[i], 3), np.concatenate(places))
             return [at.take(slice(n * len(i), (n + 1) * len(i))) for n in range(3)]
 
@@ -297,7 +298,7 @@ class PairSearch:
             root = places
         before, here, after = sides
         fixed = ((root <= first) & (slopes[0] > 0)) | ((root >= last) & (slopes[1] < 0))
-        steep = BESIDE**0.5 * np.abs(slopes)
+        steep = KINK_OFFSET**0.5 * np.abs(slopes)
         kink = (before.rate < -steep[0]) & (after.rate > steep[1]) & ~fixed
         places = here.places + np.array([[[1.0]], [[-1.0]]]) * self.pairs.radii[:, None, k] * here.n
         bounds = np.minimum(here.gap, low_of[self.pairs.owner[k]])
@@ -346,7 +347,7 @@ def _roots(
     Source: N. Anderson and A. Bjorck, A new high order method of regula falsi type, BIT 13 (1973).
     """
     (a, b), (fa, fb), i = np.array([low, high]), np.array([f_low, f_high]), np.arange(len(low))
-    place, steep = guess, STEEP * np.maximum(np.abs(f_low), np.abs(f_high))
+    place, steep = guess, STEEP_FRACTION * np.maximum(np.abs(f_low), np.abs(f_high))
     for _ in range(MOST_STEPS):
         if not len(i):
             break
@@ -358,7 +359,7 @@ def _roots(
         a[i], fa[i] = np.where(passed, near, far), np.where(passed, f_near, f_far * np.where(share > 0, share, 0.5))
         b[i], fb[i] = place, value
         step = np.minimum(np.abs(place - near), np.abs(place - a[i]))
-        i = i[(value != 0) & (step > np.where(np.abs(value) > steep[i], LAST_STEP, LAST_STEP / STEEP))]
+        i = i[(value != 0) & (step > np.where(np.abs(value) > steep[i], LAST_STEP, LAST_STEP / STEEP_FRACTION))]
         place = b[i] - fb[i] * (b[i] - a[i]) / (fb[i] - fa[i])
     return b
 

@@ -12,9 +12,9 @@ from udkjax.annotations import NumberLike, Numbers, TomlTable
 from udkjax.arrays import by_numpy, is_traced, make_module, number
 from udkjax.printing import PrintedTable, has_numbers
 from udkjax.scene.drawing.drawing_reader import (
-    BY_HAND,
-    DRAWN,
-    SECTIONS,
+    DRAWING_SECTIONS,
+    ELEMENT_SECTIONS,
+    MECHANISM_SECTIONS,
     DrawingElements,
     placement_of,
     read_drawing,
@@ -157,7 +157,7 @@ class Drawing(AbstractDrawing):
     @property
     def own_groups(self) -> dict[str, dict[str, Any]]:
         """All elements by section and name, without the values of expressions: None for a number, zero for an entry of one."""
-        sections = zip((*DRAWN, *BY_HAND), self._names, self._elements, strict=True)
+        sections = zip((*DRAWING_SECTIONS, *MECHANISM_SECTIONS), self._names, self._elements, strict=True)
         return {section: dict(zip(names, elements or (), strict=True)) for section, names, elements in sections}
 
     @property
@@ -276,7 +276,7 @@ class Drawing(AbstractDrawing):
         joints: dict[str, Joint] = {}
         for name, (pin, *pair) in joint_names(placement, list(groups["pin"])).items():
             joints[name] = Revolute(tuple(pair), placement.points(pair, [placement.places[pin]] * 2))
-        parts = {name: element.parts(placement) for s in SECTIONS if s != "motor" for name, element in groups[s].items()}
+        parts = {name: element.parts(placement) for s in ELEMENT_SECTIONS if s != "motor" for name, element in groups[s].items()}
         motors = {name: motor.parts(placement) for name, motor in groups["motor"].items()}
         joints |= {name: part.joint for name, part in parts.items() if part.joint is not None}
         drivers = {name: part.driver for name, part in motors.items() if part.driver is not None}
@@ -321,7 +321,7 @@ def _in_order(groups: Mapping[str, Mapping[str, Any]]) -> tuple[tuple[tuple[str,
 
     Instead of an empty tuple of elements, there is None.
     """
-    sections = [groups[section] for section in (*DRAWN, *BY_HAND)]
+    sections = [groups[section] for section in (*DRAWING_SECTIONS, *MECHANISM_SECTIONS)]
     return tuple(map(tuple, sections)), tuple(tuple(group.values()) or None for group in sections)
 
 
@@ -331,7 +331,7 @@ def _stored(x: Any) -> Any:
 
 def _entries(section: str, group: Mapping[str, Any] | Sequence[Any] | None) -> list[SceneEntry]:
     """Return the entries of a section, given as a mapping from names or as a list; elements of a list are named slide1, ..."""
-    cls = (DRAWN | BY_HAND)[section]
+    cls = (DRAWING_SECTIONS | MECHANISM_SECTIONS)[section]
     if isinstance(group, Mapping):
         items = list(group.items())
     elif section == "force":
@@ -342,10 +342,10 @@ def _entries(section: str, group: Mapping[str, Any] | Sequence[Any] | None) -> l
     for k, (name, item) in enumerate(items):
         if isinstance(item, cls):
             entries.append(SceneEntry(section, k, name, type(item), table_of(item), element=item))
-        elif isinstance(item, Mapping) and section in DRAWN:
+        elif isinstance(item, Mapping) and section in DRAWING_SECTIONS:
             entries.append(SceneEntry(section, k, name, cls, item))
         else:
-            kinds = "a table or of class" if section in DRAWN else "of class"
+            kinds = "a table or of class" if section in DRAWING_SECTIONS else "of class"
             problem = f"{where(section, k, name)}: must be {kinds} {cls.__name__}, not a {type(item).__name__}"
             if section == "driver" and isinstance(item, Mapping):
                 problem += "; tables of motors belong to `motors`"

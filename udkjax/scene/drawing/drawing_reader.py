@@ -29,7 +29,7 @@ from udkjax.scene.tables.element_setup import as_leaves
 from udkjax.scene.tables.schema import build, keys
 from udkjax.wording import abbreviate, quote, suggestion
 
-SECTIONS: Mapping[str, type[DrawnElement]] = {
+ELEMENT_SECTIONS: Mapping[str, type[DrawnElement]] = {
     "slide": Slide,
     "slot": PinInSlot,
     "gear": GearPair,
@@ -41,9 +41,9 @@ SECTIONS: Mapping[str, type[DrawnElement]] = {
     "load": Load,
     "friction": PinFriction,
 }
-DRAWN = {"number": NamedNumber, "pin": AbstractPin, "link": Link, **SECTIONS}
+DRAWING_SECTIONS = {"number": NamedNumber, "pin": AbstractPin, "link": Link, **ELEMENT_SECTIONS}
 ONLY_PLAIN = "must be a plain number, not the expression"
-BY_HAND = {"body": Body, "joint": Joint, "driver": Driver, "force": ForceElement}  # as in a mechanism
+MECHANISM_SECTIONS = {"body": Body, "joint": Joint, "driver": Driver, "force": ForceElement}  # as in a mechanism
 
 
 class DrawingElements(NamedTuple):
@@ -87,7 +87,7 @@ def read_drawing(
         gravity = units.convert("gravity", gravity, "m/s2", problems)
         problems += [f"{x.path}: {ONLY_PLAIN} {quote(x.text)}" for x in units.expressions[len(formulas) :]]
     problems += [] if gravity is None else gravity_mistakes(gravity)
-    named = {s: {str(e.name): e.cls for e in entries if e.section == s} for s in (*DRAWN, *BY_HAND)}
+    named = {s: {str(e.name): e.cls for e in entries if e.section == s} for s in (*DRAWING_SECTIONS, *MECHANISM_SECTIONS)}
     bodies = {GROUND: None, **named["link"], **named["body"]}
     known: dict[str, Any] = {"pin": named["pin"], "link": bodies, "body": bodies, "slide": named["slide"], "slot": named["slot"]}
     fixed_pins: Sequence[str] = ground if isinstance(ground, list | tuple) and all(isinstance(p, str) for p in ground) else ()
@@ -100,7 +100,7 @@ def read_drawing(
         for k, p in enumerate(fixed_pins)
         if p not in named["pin"]
     ]
-    groups: dict[str, dict[str, Any]] = {section: {} for section in (*DRAWN, *BY_HAND)}
+    groups: dict[str, dict[str, Any]] = {section: {} for section in (*DRAWING_SECTIONS, *MECHANISM_SECTIONS)}
     groups["number"], named["number"] = named_numbers, dict.fromkeys(named_numbers)
     for section in groups:
         if section == "body":  # the pins and links, which determine the joints, have been read

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from udkjax.scene.drawing.drawing import Drawing
-from udkjax.scene.drawing.drawing_reader import BY_HAND, DRAWN, read_drawing, units_of_element
+from udkjax.scene.drawing.drawing_reader import DRAWING_SECTIONS, MECHANISM_SECTIONS, read_drawing, units_of_element
 from udkjax.scene.drawing.drawn_quantities import Units
 from udkjax.scene.drawing.pin_forms import pin_entries
 from udkjax.scene.mechanism_tables import check_classes, check_known, head_mistakes, key_lines, read_section, type_key
@@ -15,17 +15,20 @@ from udkjax.scene.tables.checks import SceneEntry, SceneError
 from udkjax.scene.tables.schema import table_of
 from udkjax.wording import abbreviate, suggestion
 
-LISTS = tuple(section for section in DRAWN if section not in ("pin", "number"))  # sections of tables in double brackets
+# Sections of tables in double brackets.
+LISTS = tuple(section for section in DRAWING_SECTIONS if section not in ("pin", "number"))
 
 
 def drawing_of_tables(scene: Mapping[str, Any], source: str) -> Drawing:
     """Return the drawing described by the tables of a file; raise a `SceneError` that names the file."""
     head = ("format", "name", "units", "gravity", "ground", "numbers", "pins", "velocities")
-    problems = list(head_mistakes(scene, (*head, *LISTS, *BY_HAND)))
+    problems = list(head_mistakes(scene, (*head, *LISTS, *MECHANISM_SECTIONS)))
     entries = list(_read_pins(scene, problems))
-    for section in (*LISTS, *BY_HAND):
+    for section in (*LISTS, *MECHANISM_SECTIONS):
         is_counted = section in LISTS and section != "link"
-        entries.extend(read_section(section, scene.get(section, []), problems, (DRAWN | BY_HAND)[section], is_counted))
+        entries.extend(
+            read_section(section, scene.get(section, []), problems, (DRAWING_SECTIONS | MECHANISM_SECTIONS)[section], is_counted)
+        )
     ground, gravity, units = scene.get("ground", []), scene.get("gravity"), scene.get("units", {})
     elements = read_drawing(entries, ground, gravity, Units(units), numbers=scene.get("numbers", {}))
     problems.extend(elements.problems)
@@ -52,7 +55,7 @@ def drawing_text(drawing: Drawing) -> str:
     units, groups = Units(dict(drawing.units)), drawing.groups
     problems = [
         problem
-        for section in BY_HAND
+        for section in MECHANISM_SECTIONS
         for name, element in groups[section].items()
         for problem in check_classes(f'{section} "{name}"', type(element), table_of(element))
     ]
@@ -77,11 +80,11 @@ def drawing_text(drawing: Drawing) -> str:
     pins = {name: table.get("position", table) for name, table in tables.items()}
     for title, written in (("pins", pins), ("velocities", velocities)):
         lines += ["", f"[{title}]", *key_lines(written)] if written else []
-    for section in (*LISTS, *BY_HAND):
+    for section in (*LISTS, *MECHANISM_SECTIONS):
         for name, element in groups[section].items():
             table = units.write_table(element, *units_of_element(type(element), table_of(element)))
             table = texts.put(section, name, table)
-            kind = type_key(type(element)) if section in BY_HAND else {}
+            kind = type_key(type(element)) if section in MECHANISM_SECTIONS else {}
             lines += ["", f"[[{section}]]", *key_lines({"name": name, **kind, **_without_empty(table)})]
     return "\n".join(lines) + "\n"
 

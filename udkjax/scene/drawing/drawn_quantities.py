@@ -17,7 +17,15 @@ from udkjax.scene.elements.profiles import AbstractProfile, profile_class
 from udkjax.scene.numbers.formula import Measured, evaluate, is_computed, name_mistake, names_in
 from udkjax.scene.numbers.named_numbers import NamedNumber
 from udkjax.scene.numbers.sources import AbstractDrawing
-from udkjax.scene.numbers.units import FOLLOWS, QUANTITY, conversion_factor, dimension_of, field_unit, read_quantity, unit_sizes
+from udkjax.scene.numbers.units import (
+    MOTION_LAW_FIELDS,
+    QUANTITY_PATTERN,
+    conversion_factor,
+    dimension_of,
+    field_unit,
+    read_quantity,
+    unit_sizes,
+)
 from udkjax.scene.tables.schema import CLASSES_BY_TYPE, keys, table_of, type_name
 from udkjax.wording import abbreviate, quote, suggestion
 
@@ -40,7 +48,7 @@ QUANTITY_KINDS = {
     "torsional_damping": "N m s/rad",
 }
 _KIND_OF = {unit: kind for kind, unit in QUANTITY_KINDS.items()}
-VECTORS = ("axis", "to_axis", "direction", "face")  # angles that may also be vectors
+VECTOR_FIELDS = ("axis", "to_axis", "direction", "face")  # angles that may also be vectors
 
 
 class Expression(NamedTuple):
@@ -150,7 +158,7 @@ class Units:
         if isinstance(value, NamedNumber):
             value, unit = value.value, value.unit
         elif isinstance(value, str):
-            match = QUANTITY.fullmatch(value)
+            match = QUANTITY_PATTERN.fullmatch(value)
             if match is None or not match[2]:
                 raise ValueError(f"must be a number, a number with its unit or an expression, not {quote(value)}")
             value, unit = float(match[1]), match[2]
@@ -280,9 +288,9 @@ class Units:
                 )
                 continue
             unit = _unit(cls, name, variant, law)
-            if isinstance(value, np.ndarray | jax.Array) and value.ndim > 0 and name in (*VECTORS, "coefficients"):
+            if isinstance(value, np.ndarray | jax.Array) and value.ndim > 0 and name in (*VECTOR_FIELDS, "coefficients"):
                 value = list(value)
-            if name in VECTORS and isinstance(value, list | tuple):
+            if name in VECTOR_FIELDS and isinstance(value, list | tuple):
                 converted[name] = vector_as_angle(value)
                 continue
             if name == "coefficients" and isinstance(value, list | tuple):
@@ -320,7 +328,7 @@ def _field(problem: str) -> str:
 
 
 def _unit(cls: type, field: str, variant: str, law: str) -> str:
-    return law if field in FOLLOWS else field_unit(variant or cls.__name__, field)
+    return law if field in MOTION_LAW_FIELDS else field_unit(variant or cls.__name__, field)
 
 
 def _per_power(unit: str, power: int) -> str:

@@ -27,7 +27,7 @@ from udkjax.wording import quote
 DrawnGroups = Mapping[str, Mapping[str, Any]]  # elements by section and name
 
 # Tolerance relative to the largest distance between two pins. Closer points count as coincident, smaller areas as zero.
-SAME_PLACE = 1e-9
+SAME_PLACE_TOL = 1e-9
 # A pin that is farther from the other pins than this many times their largest distance is probably in another unit, such as
 # millimetres in a file in metres (1,000). Smaller factors, such as 10 (cm and mm), are not recognized.
 FAR_POINT_RATIO = 100.0
@@ -174,7 +174,7 @@ def shape_mistakes(pins: Mapping[str, AbstractPin], links: Mapping[str, Link], g
     free, size = np.array([name not in guided for name in names], bool), extent(points)
     for first, distances in _distances(points):
         for i, row in enumerate(distances, first):
-            at = np.flatnonzero(free[:i] & free[i] & (lowest[:i] != lowest[i]) & (row[:i] <= SAME_PLACE * size)).tolist()
+            at = np.flatnonzero(free[:i] & free[i] & (lowest[:i] != lowest[i]) & (row[:i] <= SAME_PLACE_TOL * size)).tolist()
             if at:
                 pin = quote(names[at[0]])
                 layers = f"or write {{stacked = {pin}}} if its links lie in another layer"
@@ -239,7 +239,7 @@ def _shape_mistakes(places: Mapping[str, PointArray], link: Link) -> Iterator[st
         key, corners = ("pins", np.array(points)) if link.kind == "plate" else ("outline", np.asarray(link.outline))
         if _crosses_itself(corners):
             yield f".{key}: the polygon crosses itself: give its corners in their order around it"
-        elif abs(twice_area(corners)) <= SAME_PLACE * extent(list(corners)) ** 2:
+        elif abs(twice_area(corners)) <= SAME_PLACE_TOL * extent(list(corners)) ** 2:
             cure = "; a bar has a width" if key == "pins" else ""
             yield f".{key}: the corners lie on one line, and enclose no area{cure}"
         elif key == "outline" and not any(_reaches(corners, point) for point in points):

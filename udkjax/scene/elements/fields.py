@@ -132,7 +132,7 @@ class FieldMetadata(TypedDict, total=False):
     names: Literal["body", "rubbing", "pin", "link", "slide", "slot"]  # kind of the names that the field holds
 
 
-CLOSES = 1e-9  # relative to the sum of the sizes: numbers of a file have more digits
+CLOSING_TOL = 1e-9  # relative to the sum of the sizes: numbers of a file have more digits
 
 _POSITIVE = Requirement("must be > 0", lambda v: v > 0)
 _NOT_NEGATIVE = Requirement("must be >= 0", lambda v: v >= 0, strict=False)
@@ -140,11 +140,11 @@ _INCREASING = Requirement("must be greater than the entry before", lambda v: arr
 _ONE_TURN = Requirement("must be less than a turn after the first (the profile closes by itself)", lambda v: v - v[0] < 2 * np.pi)
 _WHOLE_TURN = Requirement(
     "the angles must add up to a whole turn",
-    lambda v: abs(v.sum() - 2 * np.pi) * array_namespace(v).ones_like(v) <= CLOSES * 2 * np.pi,
+    lambda v: abs(v.sum() - 2 * np.pi) * array_namespace(v).ones_like(v) <= CLOSING_TOL * 2 * np.pi,
 )
 _LIFTS_RETURN, _SWINGS_RETURN = (
     Requirement(
-        f"the {steps} must add up to zero", lambda v: abs(v.sum()) * array_namespace(v).ones_like(v) <= CLOSES * abs(v).sum()
+        f"the {steps} must add up to zero", lambda v: abs(v.sum()) * array_namespace(v).ones_like(v) <= CLOSING_TOL * abs(v).sum()
     )
     for steps in ("lifts", "swings")
 )

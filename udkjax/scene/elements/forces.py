@@ -23,7 +23,7 @@ Wrench = tuple[Number, Number, Number]  # force x, force y (N, ground axes), tor
 
 # Fraction of a spring's length. Ends that are closer count as coincident, because the derivatives of the force's direction lose
 # more digits the closer the ends are: all digits between pins that a joint holds together.
-NEAREST = float(np.sqrt(np.finfo(float).eps))
+NEAREST_ENDS = float(np.sqrt(np.finfo(float).eps))
 
 
 class ForceElement(PrintsLine):
@@ -90,7 +90,7 @@ class Spring(ForceElement):
 
     def potential(self, t, *frames):
         d = between(self.points, *frames)
-        distance = d.norm(NEAREST * self.length)
+        distance = d.norm(NEAREST_ENDS * self.length)
         # |d| has a kink where the ends meet, but the energy of a spring without a length is smooth: |d|^2 is d.d.
         square = jnp.where(self.length > 0, (distance - self.length) ** 2, d.dot(d) - (2 * distance - self.length) * self.length)
         return 0.5 * self.stiffness * square

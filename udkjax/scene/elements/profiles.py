@@ -109,7 +109,7 @@ def _4567(x: Array) -> Array:
 
 
 # Laws by name: the share of the lift over the share of the angle, both from 0 to 1.
-LAWS: Mapping[str, Callable[[Array], Array]] = {
+LIFT_LAWS: Mapping[str, Callable[[Array], Array]] = {
     "dwell": _dwell,
     "cycloidal": _cycloidal,
     "harmonic": _harmonic,
@@ -170,7 +170,7 @@ class LawProfile(AbstractProfile):
         travel = 0.0 * turned  # not zero: an undefined angle gives an undefined travel
         for k, name in enumerate(self.law):
             begin, below = (ends[k - 1], heights[k - 1]) if k else (0.0, 0.0)
-            risen = below + steps[k] * LAWS[name]((turned - begin) / self.angle[k])
+            risen = below + steps[k] * LIFT_LAWS[name]((turned - begin) / self.angle[k])
             travel = jnp.where(turned >= begin, risen, travel)
         return self.distance(travel, flat)
 

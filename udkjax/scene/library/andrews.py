@@ -22,7 +22,7 @@ A, B, C = (-0.06934, -0.00227), (-0.03635, 0.03273), (0.014, 0.072)
 D, DA, E, EA, FA = 0.028, 0.0115, 0.02, 0.01421, 0.01421
 RR, RA, SS, SA, SB, SC, SD = 0.007, 0.00092, 0.035, 0.01874, 0.01043, 0.018, 0.02
 ZT, TA, TB, U, UA, UB, ZF = 0.04, 0.02308, 0.00916, 0.04, 0.01228, 0.00449, 0.02
-START: Mapping[str, float] = MappingProxyType(  # rad
+START_ANGLES: Mapping[str, float] = MappingProxyType(  # rad
     {
         "beta": -0.0617138900142764496358948458001,
         "theta": 0.0,
@@ -83,6 +83,6 @@ def andrews_squeezer(
         "motor": Torque((GROUND, "K1"), torque),
         "spring": Spring((GROUND, "K3"), [C, (SD - SB, SA - SC)], stiffness, spring_length),
     }
-    angles = np.array(list(START.values()))
+    angles = np.array(list(START_ANGLES.values()))
     bodies = bodies_on_pose([f"K{i}" for i in range(1, 8)], list(zip(MASSES, INERTIAS, strict=True)), pose, angles, np.zeros(7))
     return Mechanism(bodies, joints, forces=forces, gravity=gravity, name="Andrews' squeezing mechanism")

@@ -29,7 +29,8 @@ BOOM = {"centre": (0.44, 0.09), "foot": (0.0, 0.0), "tip": (1.0, 0.0), "cylinder
 STICK = {"centre": (0.35, 0.05), "tip": (0.0, 0.0), "rocker": (0.855, 0.02), "bucket": (1.0, 0.0)}
 STICK |= {"cylinder": (-0.22, 0.10), "bucket cylinder": (0.05, 0.20)}
 BUCKET = {"centre": (0.45, 0.20), "bucket": (0.0, 0.0), "link": (-0.13, 0.28)}
-BASE = (0.13, -0.09)  # pin of the boom's cylinder on the ground, relative to the boom's foot, in units of the boom's length
+# Pin of the boom's cylinder on the ground, relative to the boom's foot, in units of the boom's length.
+CYLINDER_BASE = (0.13, -0.09)
 
 
 @with_concrete_numbers
@@ -61,7 +62,7 @@ def excavator(
     on_rocker, on_link = ((k * np.array([-0.5, 0.0]), k * np.array([0.5, 0.0])) for k in (rocker, link))
     names = ("boom", "stick", "rocker", "link", "bucket")
     cylinders = {
-        "boom cylinder": ((GROUND, "boom"), (boom * np.array(BASE), on_boom["cylinder"])),
+        "boom cylinder": ((GROUND, "boom"), (boom * np.array(CYLINDER_BASE), on_boom["cylinder"])),
         "stick cylinder": (("boom", "stick"), (on_boom["stick cylinder"], on_stick["cylinder"])),
         "bucket cylinder": (("stick", "rocker"), (on_stick["bucket cylinder"], on_rocker[1])),
     }

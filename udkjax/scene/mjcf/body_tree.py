@@ -7,12 +7,12 @@ from typing import NamedTuple
 import numpy as np
 
 from udkjax.scene.mjcf.geom_masses import SpaceMass, geom_mass, geom_shape, inertial_mass
-from udkjax.scene.mjcf.model_settings import MAIN, ModelSettings
-from udkjax.scene.mjcf.orientations import WORLD, SpaceFrame
+from udkjax.scene.mjcf.model_settings import MAIN_CLASS, ModelSettings
+from udkjax.scene.mjcf.orientations import WORLD_FRAME, SpaceFrame
 from udkjax.scene.mjcf.xml_tree import AttributeReader, XmlElement
 from udkjax.wording import quote, suggestion
 
-JOINTS = ("hinge", "slide")
+JOINT_TYPES = ("hinge", "slide")
 
 
 class TreeJoint(NamedTuple):
@@ -56,12 +56,14 @@ class BodyTree:
 
     def __init__(self, root: XmlElement, settings: ModelSettings):
         self.settings = settings
-        self.bodies = [TreeBody("world", 0, WORLD, "<worldbody>")]
+        self.bodies = [TreeBody("world", 0, WORLD_FRAME, "<worldbody>")]
         self.sites: dict[str, tuple[int, SpaceFrame]] = {}
         self.geoms: list[TreeGeom] = []
         self.joints: dict[str, TreeJoint] = {}
         self._index = {"world": 0}
-        pending = [(child, 0, WORLD, MAIN) for world in root.children if world.tag == "worldbody" for child in world.children]
+        pending = [
+            (child, 0, WORLD_FRAME, MAIN_CLASS) for world in root.children if world.tag == "worldbody" for child in world.children
+        ]
         pending.reverse()
         while pending:
             element, body, frame, childclass = pending.pop()
@@ -129,7 +131,7 @@ class BodyTree:
         kind = read.text("type", "hinge")
         axis = frame.axes @ read.numbers("axis", (0.0, 0.0, 1.0))
         size = float(np.linalg.norm(axis))
-        if kind not in JOINTS:
+        if kind not in JOINT_TYPES:
             cure = "; a free planar body has two slides and a hinge" if kind == "free" else ""
             read.refuse(f"a {kind} joint does not stay in a plane{cure}")
         elif not body:

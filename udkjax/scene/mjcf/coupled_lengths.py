@@ -10,7 +10,7 @@ from udkjax.scene.mjcf.model_settings import merge_parts
 from udkjax.scene.mjcf.plane_model import AXES_TOL, Ends, Pair, PlaneModel, gap_of
 from udkjax.scene.mjcf.xml_tree import AttributeReader, XmlElement
 
-EVEN = 1e-12  # relative to the largest term: smaller sums of angles are rounding errors
+ROUNDING_OF_SUMS = 1e-12  # relative to the largest term: smaller sums of angles are rounding errors
 
 
 class CoupledLength(NamedTuple):
@@ -140,7 +140,9 @@ class CoupledLengths:
             for body, coefficient in term.angles.items():
                 angles[body] = angles.get(body, 0.0) + factor * coefficient
         largest = max(map(abs, angles.values()), default=0.0)
-        angles = {body: coefficient for body, coefficient in sorted(angles.items()) if abs(coefficient) > EVEN * largest}
+        angles = {
+            body: coefficient for body, coefficient in sorted(angles.items()) if abs(coefficient) > ROUNDING_OF_SUMS * largest
+        }
         length, at_rest = (sum(factor * getattr(term, name) for term, factor in terms) for name in ("length", "at_rest"))
         if min(angles, default=0) < 0:
             read.refuse("couples one of the two hinges of a body: not supported")

@@ -13,7 +13,7 @@ from udkjax.scene.mjcf.plane_model import AXES_TOL, Ends, PlaneMotion
 from udkjax.scene.mjcf.xml_tree import AttributeReader, XmlElement
 
 DEFAULT_POLYNOMIAL = (0.0, 1.0, 0.0, 0.0, 0.0)  # of a polycoef that is not given
-MESHED = 1e-9  # rad, times the largest factor: rounding error of the angles of gears that mesh in the initial state
+MESHING_TOL = 1e-9  # rad, times the largest factor: rounding error of the angles of gears that mesh in the initial state
 
 
 class EqualityReader:
@@ -125,7 +125,7 @@ class EqualityReader:
     def _is_in_mesh(self, length: CoupledLength, offset: float) -> bool:
         """Return True if the initial state satisfies an equality of angles, so that gears can start in mesh."""
         mismatch = sum(factor * self._motions[body].angle for body, factor in length.angles.items())
-        return len(length.angles) == 3 and not offset and abs(mismatch) <= MESHED * max(map(abs, length.angles.values()))
+        return len(length.angles) == 3 and not offset and abs(mismatch) <= MESHING_TOL * max(map(abs, length.angles.values()))
 
     def _hold(self, read: AttributeReader, length: CoupledLength | None, offset: float) -> None:
         """Add the joint that fixes a length at its value in the file plus an offset."""

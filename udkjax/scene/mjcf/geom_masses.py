@@ -7,9 +7,9 @@ import numpy as np
 from udkjax.scene.mjcf.orientations import SpaceFrame, shortest_turn_of_z
 from udkjax.scene.mjcf.xml_tree import AttributeReader
 
-SHAPES = {"sphere": 1, "capsule": 2, "cylinder": 2, "ellipsoid": 3, "box": 3}  # number of sizes
+SHAPE_SIZES = {"sphere": 1, "capsule": 2, "cylinder": 2, "ellipsoid": 3, "box": 3}  # number of sizes
 WITHOUT_MASS = ("plane", "hfield", "mesh", "sdf")  # the first two are massless; the masses of the others are not computed
-WATER = 1000.0  # kg/m^3, the default density of MJCF
+DEFAULT_DENSITY = 1000.0  # kg/m^3, the default density of MJCF
 
 
 class SpaceMass(NamedTuple):
@@ -40,21 +40,23 @@ def geom_shape(read: AttributeReader, frame: SpaceFrame) -> tuple[str, np.ndarra
 
     `frame` is the frame of the geom, or if it has a `fromto`, the frame of these coordinates.
     """
-    kind = read.choice("type", (*SHAPES, *WITHOUT_MASS), "sphere")
-    if kind not in SHAPES:
+    kind = read.choice("type", (*SHAPE_SIZES, *WITHOUT_MASS), "sphere")
+    if kind not in SHAPE_SIZES:
         return kind, np.zeros(3), frame
-    ends, count = None, SHAPES[kind]
+    ends, count = None, SHAPE_SIZES[kind]
     if "fromto" in read and kind != "sphere":
         ends, count = read.numbers("fromto", np.zeros(6)).reshape(2, 3), 1
     size = read.numbers("size", np.zeros(3), fewest=count)
     if ends is not None:
         direction = ends[1] - ends[0]
         half = 0.5 * float(np.linalg.norm(direction))
-        size = np.array([size[0], half, 0.0] if SHAPES[kind] == 2 else [size[0], size[0], half])
+        size = np.array([size[0], half, 0.0] if SHAPE_SIZES[kind] == 2 else [size[0], size[0], half])
         axes = shortest_turn_of_z(direction) if half > 0 else np.eye(3)
         frame = frame.within(SpaceFrame(axes, ends.mean(axis=0)))
-    if not np.all(size[: SHAPES[kind]] > 0):
-        read.refuse(f"the sizes of a {kind} must be greater than zero, not {' '.join(f'{x:g}' for x in size[: SHAPES[kind]])}")
+    if not np.all(size[: SHAPE_SIZES[kind]] > 0):
+        read.refuse(
+            f"the sizes of a {kind} must be greater than zero, not {' '.join(f'{x:g}' for x in size[: SHAPE_SIZES[kind]])}"
+        )
     return kind, size, frame
 
 
@@ -62,7 +64,7 @@ def geom_mass(read: AttributeReader, kind: str, size: np.ndarray, frame: SpaceFr
     """Return the mass of a geom with a kind, sizes (m) and a frame in the world, as from `geom_shape`; None if it is massless."""
     if "mass" in read and not read.number("mass"):
         return None
-    if kind not in SHAPES:
+    if kind not in SHAPE_SIZES:
         if kind in ("mesh", "sdf"):
             read.refuse(f"the mass of a {kind} is not computed: give its body an <inertial>")
         return None
@@ -76,7 +78,7 @@ def geom_mass(read: AttributeReader, kind: str, size: np.ndarray, frame: SpaceFr
         a, b, c = (a, a, a) if kind == "sphere" else (a, b, c)
         volume = a * b * c * (8.0 if kind == "box" else 4 / 3 * np.pi)
         unit = np.array([b**2 + c**2, c**2 + a**2, a**2 + b**2]) / (3.0 if kind == "box" else 5.0)
-    mass = read.number("mass") if "mass" in read else volume * read.number("density", WATER)
+    mass = read.number("mass") if "mass" in read else volume * read.number("density", DEFAULT_DENSITY)
     return SpaceMass(mass, frame.origin, frame.axes @ np.diag(mass * unit) @ frame.axes.T)
 
 

@@ -24,8 +24,8 @@ from udkjax.scene.mjcf.xml_tree import AttributeReader, XmlElement, parse_xml
 from udkjax.scene.tables.checks import SceneError
 from udkjax.wording import abbreviate, suggestion
 
-INITIAL = "initial"  # the keyframe with velocities and controls that `mjcf_text` writes
-OPEN_LOOP = 1e-9  # relative to the size of the model: smaller gaps are rounding errors
+INITIAL_KEYFRAME = "initial"  # the keyframe with velocities and controls that `mjcf_text` writes
+OPEN_LOOP_TOL = 1e-9  # relative to the size of the model: smaller gaps are rounding errors
 ROTOR_MASS = 0.01  # mass of a rotor relative to the body that carries it
 
 
@@ -118,7 +118,7 @@ def _initial_state(root: XmlElement, model: PlaneModel, key: str | None) -> tupl
     problems, joints = model.tree.settings.problems, [joint.name for joint in model.joints]
     if key is not None and key not in keys:
         problems.append(f"<keyframe>: no key has the name {abbreviate(key)}{suggestion(key, keys)}")
-    element = keys.get(INITIAL if key is None else key)
+    element = keys.get(INITIAL_KEYFRAME if key is None else key)
     if element is None:
         return {}, {}, {}
     read = AttributeReader(element, element.attributes, problems)
@@ -223,5 +223,5 @@ def _gaps(mechanism: Mechanism, loops: list[str], size: float) -> list[tuple[str
         joint = mechanism.joints[name]
         frames = [GROUND_FRAME if body == GROUND else mechanism.bodies[body].frame() for body in joint.frame_names]
         gap = float(np.max(np.abs(np.asarray(joint.residual(0.0, *frames)))))
-        gaps += [(name, gap)] if gap > OPEN_LOOP * max(size, 1.0) else []
+        gaps += [(name, gap)] if gap > OPEN_LOOP_TOL * max(size, 1.0) else []
     return gaps

@@ -20,8 +20,8 @@ from udkjax.scene.elements.joints import Angle, Constraint, Distance, Prismatic,
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.mechanism_tables import check_known
 from udkjax.scene.mjcf.body_tree import unique_name
-from udkjax.scene.mjcf.coupled_lengths import EVEN
-from udkjax.scene.mjcf.mjcf_reader import INITIAL, OPEN_LOOP
+from udkjax.scene.mjcf.coupled_lengths import ROUNDING_OF_SUMS
+from udkjax.scene.mjcf.mjcf_reader import INITIAL_KEYFRAME, OPEN_LOOP_TOL
 from udkjax.scene.reshaping import attachments
 from udkjax.scene.spanning_tree import spanning_tree
 from udkjax.scene.suspicions import body_sizes
@@ -29,8 +29,8 @@ from udkjax.scene.tables.checks import SceneError
 from udkjax.wording import quote
 
 IN_TREE = (Weld, Prismatic, Slot), (Revolute,), (Distance,), (Angle,)  # joints that no equality can express come first
-NORMAL = "0 -1 0"  # normal of the x-z plane: angles are anticlockwise about it, with x to the right and z up
-THICKNESS = 0.04  # thickness of the drawn bars, relative to the size of the largest body
+PLANE_NORMAL = "0 -1 0"  # normal of the x-z plane: angles are anticlockwise about it, with x to the right and z up
+BAR_THICKNESS = 0.04  # thickness of the drawn bars, relative to the size of the largest body
 
 Attributes = dict[str, str]
 
@@ -122,7 +122,7 @@ class _Writer:
             lines += [f"  <{section}>", *(f"    {item}" for item in items), f"  </{section}>"] if items else []
         if any(rates) or any(self.controls):
             values = {"qvel": _numbers(*rates)} | ({"ctrl": _numbers(*self.controls)} if self.controls else {})
-            lines += ["  <keyframe>", f"    <key{_attributes(name=INITIAL, **values)}/>", "  </keyframe>"]
+            lines += ["  <keyframe>", f"    <key{_attributes(name=INITIAL_KEYFRAME, **values)}/>", "  </keyframe>"]
         if self.problems:
             raise SceneError(self.problems, self.mechanism.name)
         return "\n".join([*lines, "</mujoco>", ""])
@@ -139,7 +139,7 @@ class _Writer:
             hinges_and_slides.append(
                 _TreeJoint(
                     title,
-                    {"axis": NORMAL, "pos": _in_space(body_frame.local((pin.x - body_frame.x, pin.y - body_frame.y)))},
+                    {"axis": PLANE_NORMAL, "pos": _in_space(body_frame.local((pin.x - body_frame.x, pin.y - body_frame.y)))},
                     rate,
                 )
             )
@@ -157,7 +157,7 @@ class _Writer:
             return hinges_and_slides
         joint = self.mechanism.joints[joint_name]
         gap = float(np.max(np.abs(joint.residual(0.0, *(self.frames[body] for body in joint.bodies)))))
-        if gap > OPEN_LOOP * max(self.size, 1.0):
+        if gap > OPEN_LOOP_TOL * max(self.size, 1.0):
             cure = "MJCF uses the initial positions as they are: close them with `udk.assemble`"
             self.problems.append(f"joint {quote(joint_name)}: is open by {gap:.3g} (m, rad), and {cure}")
         first, second = (self.frames[body] for body in joint.bodies)
@@ -193,12 +193,12 @@ class _Writer:
         angle = body_frame.angle - parent_frame.angle
         position = _in_space(parent_frame.local((body_frame.x - parent_frame.x, body_frame.y - parent_frame.y)))
         inertia = _numbers(body.inertia, body.inertia, body.inertia)
-        radius = 0.5 * THICKNESS * self.size
+        radius = 0.5 * BAR_THICKNESS * self.size
         points = [Point(*np.asarray(point).tolist()) for _, point in attachments(self.mechanism, name)]
         ends = {_in_space(point) for point in points if point.norm() > radius}
         look = {"mass": "0", "contype": "0", "conaffinity": "0", "size": _numbers(radius)}
         return [
-            f"<body{_attributes(name=name, pos=position, axisangle=f'{NORMAL} {_numbers(angle)}')}>",
+            f"<body{_attributes(name=name, pos=position, axisangle=f'{PLANE_NORMAL} {_numbers(angle)}')}>",
             *(f"  <joint{_attributes(name=j.name, **j.attributes, **self._passive(j.name))}/>" for j in self.joints[name]),
             f"  <inertial{_attributes(pos='0 0 0', mass=_numbers(body.mass), diaginertia=inertia)}/>",
             *(f"  <geom{_attributes(type='capsule', fromto=f'0 0 0 {end}', **look)}/>" for end in sorted(ends)),
@@ -281,7 +281,7 @@ class _Writer:
             directions = [self.frames[b].angle + float(a) for b, a in ((bodies[0], axis), (joint.bodies[0], joint.axis))]
             lengthwise = float(np.cos(directions[1] - directions[0]))
             same_point = joint.bodies == tuple(bodies) and points is not None and np.array_equal(points[1], joint.points[1])
-            if abs(abs(lengthwise) - 1) <= EVEN and (isinstance(joint, Prismatic) or same_point):
+            if abs(abs(lengthwise) - 1) <= ROUNDING_OF_SUMS and (isinstance(joint, Prismatic) or same_point):
                 return (edge.joint if isinstance(joint, Prismatic) else f"{edge.joint}.slide"), sign * float(np.sign(lengthwise))
         return None
 
@@ -341,7 +341,7 @@ class _Writer:
         for body, factor in factors.items():
             for hinge, weight in self.turns[body].items():
                 hinges[hinge] = hinges.get(hinge, 0.0) + factor * weight
-        threshold = EVEN * max(map(abs, hinges.values()), default=0.0)
+        threshold = ROUNDING_OF_SUMS * max(map(abs, hinges.values()), default=0.0)
         return {hinge: weight for hinge, weight in hinges.items() if abs(weight) > threshold}
 
     def _add_fixed(self, name: str, hinges: dict[str, float], kind: str, **attributes: str) -> str:
@@ -367,7 +367,7 @@ class _Writer:
         """Add a site for each of two points, the first turned by an angle (rad); return their names."""
         titles = [self._unique(f"{name}.{body}") for body in bodies]
         for title, body, point, turn in zip(titles, bodies, points, (angle, 0.0), strict=True):
-            orientation = {"axisangle": f"{NORMAL} {_numbers(turn)}"} if turn else {}
+            orientation = {"axisangle": f"{PLANE_NORMAL} {_numbers(turn)}"} if turn else {}
             self.sites[body].append({"name": title, "pos": _in_space(Point(*point.tolist())), **orientation})
         return titles
 

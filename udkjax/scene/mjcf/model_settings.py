@@ -7,9 +7,9 @@ from udkjax.scene.mjcf.vocabulary import ACTUATORS
 from udkjax.scene.mjcf.xml_tree import AttributeReader, XmlElement
 from udkjax.wording import abbreviate, quote, suggestion
 
-MAIN = "main"  # the default class
+MAIN_CLASS = "main"  # the default class
 _COMMON_TO_ACTUATORS = ("gear", "ctrlrange", "ctrllimited", "forcerange", "forcelimited")
-_STANDARD = "constraint equality limit contact spring damper gravity actuation frictionloss".split()
+_STANDARD_FLAGS = "constraint equality limit contact spring damper gravity actuation frictionloss".split()
 
 
 class ModelSettings:
@@ -17,7 +17,7 @@ class ModelSettings:
 
     def __init__(self, root: XmlElement, problems: list[str]):
         self.problems = problems
-        self._defaults: dict[str, dict[str, dict[str, str]]] = {MAIN: {}}
+        self._defaults: dict[str, dict[str, dict[str, str]]] = {MAIN_CLASS: {}}
         compilers, options, flags = (merge_parts(root, path) for path in (("compiler",), ("option",), ("option", "flag")))
         read = AttributeReader(compilers, compilers.attributes, problems)
         self.radians = math.pi / 180 if read.choice("angle", ("degree", "radian"), "degree") == "degree" else 1.0
@@ -30,17 +30,17 @@ class ModelSettings:
         self.total_mass = read.number("settotalmass", -1.0)  # kg; masses are not scaled if it is not positive
         self.mass_groups = read.numbers("inertiagrouprange", (0, 5))
         read = AttributeReader(flags, flags.attributes, problems)
-        off = {name for name in _STANDARD if read.choice(name, ("enable", "disable"), "enable") == "disable"}
+        off = {name for name in _STANDARD_FLAGS if read.choice(name, ("enable", "disable"), "enable") == "disable"}
         self.disabled = off | ({"equality", "limit", "contact", "frictionloss"} if "constraint" in off else set())
         self.gravity = AttributeReader(options, options.attributes, problems).numbers("gravity", (0.0, 0.0, -9.81))
         if "gravity" in self.disabled:
             self.gravity = 0 * self.gravity
-        pending = [(child, MAIN) for child in root.children if child.tag == "default"]
+        pending = [(child, MAIN_CLASS) for child in root.children if child.tag == "default"]
         while pending:
             element, parent = pending.pop()
             at_top = element in root.children
-            name = element.attributes.get("class", MAIN if at_top else "")
-            if not name or (at_top and name != MAIN):
+            name = element.attributes.get("class", MAIN_CLASS if at_top else "")
+            if not name or (at_top and name != MAIN_CLASS):
                 problems.append(
                     f"{element.where}: class={quote(name)}: the default class at the top is main; rename the classes below it"
                 )
@@ -53,7 +53,7 @@ class ModelSettings:
                 else:
                     class_defaults.setdefault(child.tag, {}).update(child.attributes)
 
-    def read(self, element: XmlElement, childclass: str = MAIN, section: str = "") -> AttributeReader:
+    def read(self, element: XmlElement, childclass: str = MAIN_CLASS, section: str = "") -> AttributeReader:
         """Return the attributes of an element with the defaults of its class, or of the class of the body that holds it.
 
         `section` is the tag of the defaults, if it differs from the tag of the element.

@@ -24,7 +24,7 @@ class SpaceFrame(NamedTuple):
         return SpaceFrame(self.axes @ child.axes, self.point(child.origin))
 
 
-WORLD = SpaceFrame(np.eye(3), np.zeros(3))
+WORLD_FRAME = SpaceFrame(np.eye(3), np.zeros(3))
 
 
 def frame_of(read: AttributeReader, radians: float, sequence: str) -> SpaceFrame:

@@ -11,13 +11,13 @@ from udkjax.wording import quote
 
 # Elements without effect on motions.
 WITHOUT_EFFECT = ("visual", "statistic", "asset", "sensor", "custom", "size", "light", "camera")
-CONTEXTS = ("equality", "spatial", "fixed")  # parents that determine the meaning of the tags of their children
+CONTEXT_TAGS = ("equality", "spatial", "fixed")  # parents that determine the meaning of the tags of their children
 ACTUATORS = ("motor", "position", "velocity", "general")
-SHAPELESS = ("material", "mesh", "texture", "pair")  # only in defaults
+DEFAULTS_ONLY = ("material", "mesh", "texture", "pair")  # only in defaults
 
-_POSE = "pos quat axisangle xyaxes zaxis euler"
-_LOOK = "group material rgba user"
-_SOFT = "solref solimp"  # softness of constraints, which are ideal here
+_POSE_ATTRIBUTES = "pos quat axisangle xyaxes zaxis euler"
+_LOOK_ATTRIBUTES = "group material rgba user"
+_SOFTNESS = "solref solimp"  # softness of constraints, which are ideal here
 
 
 class _Attributes(NamedTuple):
@@ -32,13 +32,13 @@ def _actuator(used: str = "", **inactive: str) -> _Attributes:
     return _Attributes(f"{shared} {used}", idle, {"damping": "0", "armature": "0", "delay": "0", "nsample": "0", **inactive})
 
 
-_EQUALITY = _Attributes("name class active", _SOFT)
+_EQUALITY = _Attributes("name class active", _SOFTNESS)
 _TENDON = _Attributes(
     "name class limited range springlength stiffness damping frictionloss",
-    f"width margin solreflimit solimplimit solreffriction solimpfriction {_LOOK}",
+    f"width margin solreflimit solimplimit solreffriction solimpfriction {_LOOK_ATTRIBUTES}",
     {"armature": "0", "springyield": "0"},
 )
-_KNOWN: dict[str, _Attributes] = {
+_KNOWN_ATTRIBUTES: dict[str, _Attributes] = {
     "compiler": _Attributes(
         "angle eulerseq autolimits inertiafromgeom inertiagrouprange settotalmass",
         "meshdir texturedir assetdir strippath discardvisual usethread fusestatic saveinertial savecompiled savecanonical "
@@ -60,9 +60,9 @@ _KNOWN: dict[str, _Attributes] = {
     "mujoco": _Attributes("model"),
     "default": _Attributes("class"),
     "worldbody": _Attributes(""),
-    "body": _Attributes(f"name childclass {_POSE}", "user sleep simple fuse", {"mocap": "false", "gravcomp": "0"}),
-    "frame": _Attributes(f"name childclass {_POSE}"),
-    "inertial": _Attributes(f"mass diaginertia fullinertia {_POSE}"),
+    "body": _Attributes(f"name childclass {_POSE_ATTRIBUTES}", "user sleep simple fuse", {"mocap": "false", "gravcomp": "0"}),
+    "frame": _Attributes(f"name childclass {_POSE_ATTRIBUTES}"),
+    "inertial": _Attributes(f"mass diaginertia fullinertia {_POSE_ATTRIBUTES}"),
     "joint": _Attributes(
         "name class type pos axis range limited ref springref stiffness damping armature frictionloss actuatorfrcrange "
         "actuatorfrclimited",
@@ -70,11 +70,11 @@ _KNOWN: dict[str, _Attributes] = {
         {"springdamper": "0 0", "springyield": "0"},
     ),
     "geom": _Attributes(
-        f"name class type size fromto mass density contype conaffinity group {_POSE}",
-        f"mesh hfield condim priority friction solmix margin gap fluidcoef {_SOFT} {_LOOK}",
+        f"name class type size fromto mass density contype conaffinity group {_POSE_ATTRIBUTES}",
+        f"mesh hfield condim priority friction solmix margin gap fluidcoef {_SOFTNESS} {_LOOK_ATTRIBUTES}",
         {"shellinertia": "false", "fluidshape": "none"},
     ),
-    "site": _Attributes(f"name class fromto {_POSE}", f"type mesh size {_LOOK}"),
+    "site": _Attributes(f"name class fromto {_POSE_ATTRIBUTES}", f"type mesh size {_LOOK_ATTRIBUTES}"),
     "equality": _EQUALITY,
     "connect": _EQUALITY._replace(used=f"{_EQUALITY.used} body1 body2 anchor site1 site2"),
     "weld": _EQUALITY._replace(
@@ -93,7 +93,7 @@ _KNOWN: dict[str, _Attributes] = {
     "velocity": _actuator("kv"),
     "general": _actuator("gainprm biasprm gaintype biastype", dyntype="none", dynprm="1", actdim="-1", inheritrange="0"),
     "contact": _Attributes(""),
-    "pair": _Attributes("name class geom1 geom2", f"condim friction gap margin solreffriction {_SOFT}"),
+    "pair": _Attributes("name class geom1 geom2", f"condim friction gap margin solreffriction {_SOFTNESS}"),
     "exclude": _Attributes("name body1 body2"),
     "keyframe": _Attributes(""),
     "key": _Attributes("name qpos qvel ctrl", "time act mpos mquat plastic"),
@@ -113,16 +113,16 @@ def unknown_parts(root: XmlElement) -> list[str]:
         return [f"{root.where}: an MJCF model begins with <mujoco>"]
     skipped: set[int] = set()
     for element, parent in [(root, root), *root.walk()]:
-        if id(parent) in skipped or element.tag in WITHOUT_EFFECT or (parent.tag == "default" and element.tag in SHAPELESS):
+        if id(parent) in skipped or element.tag in WITHOUT_EFFECT or (parent.tag == "default" and element.tag in DEFAULTS_ONLY):
             skipped.add(id(element))
             continue
         path = f"{parent.tag}/{element.tag}"
-        key = path if parent.tag in CONTEXTS and element.tag in ("joint", "tendon", "site", "geom") else element.tag
-        if key not in _KNOWN:
+        key = path if parent.tag in CONTEXT_TAGS and element.tag in ("joint", "tendon", "site", "geom") else element.tag
+        if key not in _KNOWN_ATTRIBUTES:
             skipped.add(id(element))
             problems.append(f"{element.where}: not supported{_cure(element.tag)}")
             continue
-        known = _KNOWN[key]
+        known = _KNOWN_ATTRIBUTES[key]
         words = {*known.used.split(), *known.idle.split()}
         for name, value in element.attributes.items():
             if name not in words and not _is_without_effect(value, known.inactive.get(name)):

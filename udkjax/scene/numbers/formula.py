@@ -12,12 +12,12 @@ import numpy as np
 from udkjax.arrays import array_namespace, by_numpy
 from udkjax.wording import quote, suggestion
 
-LONGEST = 500  # characters of an expression
-_DEEP = re.compile(r"[-+(]{50}")  # so many signs and brackets in a row are no expression that one would write
+LONGEST_TEXT = 500  # characters of an expression
+_DEEP_NESTING = re.compile(r"[-+(]{50}")  # so many signs and brackets in a row are no expression that one would write
 CONSTANTS = {"pi": math.pi}
 FUNCTIONS = {"sqrt": 1, "abs": 1, "sin": 1, "cos": 1, "tan": 1, "asin": 1, "acos": 1, "atan": 1, "atan2": 2, "hypot": 2}
-_INVERSE = ("asin", "acos", "atan", "atan2")  # functions that return angles
-_NUMPY = {"asin": "arcsin", "acos": "arccos", "atan": "arctan", "atan2": "arctan2"}
+_ANGLE_FUNCTIONS = ("asin", "acos", "atan", "atan2")  # functions that return angles
+_NUMPY_NAMES = {"asin": "arcsin", "acos": "arccos", "atan": "arctan", "atan2": "arctan2"}
 _SYNTAX = "write numbers and names with + - * / **, ( ), and " + ", ".join(FUNCTIONS)
 
 
@@ -36,7 +36,7 @@ class Measured(NamedTuple):
 @lru_cache(1024)
 def parse(text: str) -> ast.expr | None:
     """Return the syntax tree of an expression of numbers, names, operations and functions; None for any other text."""
-    if len(text) > LONGEST or _DEEP.search(text.replace(" ", "")):
+    if len(text) > LONGEST_TEXT or _DEEP_NESTING.search(text.replace(" ", "")):
         return None
     try:
         tree = ast.parse(text.strip().replace("^", "**"), mode="eval").body
@@ -159,12 +159,12 @@ def _common(unit: str | None, other: str | None) -> str | None:
 
 def _called(name: str, given: list[Measured], angle: float) -> Measured:
     values, units = [x.value for x in given], [x.unit for x in given]
-    function = getattr(array_namespace(*values), _NUMPY.get(name, name))
+    function = getattr(array_namespace(*values), _NUMPY_NAMES.get(name, name))
     if name in ("sin", "cos", "tan"):
         if units[0] not in ("", "rad", None):
             raise ValueError(f"{name} needs an angle, not a quantity in {units[0]}")
         return Measured(function(values[0] * angle), "")
-    if name in _INVERSE:
+    if name in _ANGLE_FUNCTIONS:
         return Measured(function(*values) / angle, "rad")
     unit = units[0] if name == "abs" else _common(*units) if name == "hypot" else "" if units[0] == "" else None
     return Measured(function(*values), unit)

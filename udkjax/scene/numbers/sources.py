@@ -250,12 +250,12 @@ jax.tree_util.register_pytree_node(Follows, _refuse, lambda text, _: Follows(tex
 
 MOST_STRUCTURES = 256
 _derivations: "OrderedDict[TreeDef, Derivation]" = OrderedDict()  # of the structures met so far
-_NUMBERS = (jax.Array, np.ndarray, np.generic, float)
+_NUMBER_TYPES = (jax.Array, np.ndarray, np.generic, float)
 
 
 def is_number(leaf: object) -> bool:
     """Return True if a leaf is a number, not an object that a function on trees has put in its place."""
-    return isinstance(leaf, _NUMBERS)
+    return isinstance(leaf, _NUMBER_TYPES)
 
 
 _derived = defined(deferred(lambda source: source.derived(), keeps_concrete=True))
@@ -323,7 +323,7 @@ def _transformed(leaves: Leaves, tree: TreeDef, axes: Sequence[int]) -> Elements
     function: Callable[..., list[Any]] = numbers
     for depth in range(1, max(axes) + 1):
         function = jax.vmap(function, [0 if count >= depth else None for count in axes])
-    is_concrete = all(isinstance(x, _NUMBERS) for x in leaves)
+    is_concrete = all(isinstance(x, _NUMBER_TYPES) for x in leaves)
     results = jax.jit(function)(*leaves) if is_concrete else jax.eval_shape(function, *leaves)
     return found[0].with_leaves(leaves, results)
 

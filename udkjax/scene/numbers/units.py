@@ -84,7 +84,7 @@ _OF_TYPE = {
     ("CamPair", "face"): "rad",
     ("SlideMotor", "speed"): "m/s",
 }
-FOLLOWS = ("amplitude", "offset", "values")  # a motion law has the unit of the coordinate that it drives
+MOTION_LAW_FIELDS = ("amplitude", "offset", "values")  # a motion law has the unit of the coordinate that it drives
 
 
 def units_of(mechanism: Any, name: str) -> str:
@@ -109,7 +109,7 @@ def units_of(mechanism: Any, name: str) -> str:
 
 def field_unit(type_name: str, field: str, driven: str = "") -> str:
     """Return the unit of a field of a scene class, "" if unknown; that of a motion law depends on the driven coordinate."""
-    if field in FOLLOWS:
+    if field in MOTION_LAW_FIELDS:
         return "rad" if driven == "angle" else "m"
     return _OF_TYPE.get((type_name, field), _FIELDS.get(field, ""))
 
@@ -127,10 +127,10 @@ class _Unit(NamedTuple):
 
 
 # Powers of length, mass, time and angle.
-_NONE, _LENGTH, _MASS, _TIME, _ANGLE = (0, 0, 0, 0), (1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1)
+_DIMENSIONLESS, _LENGTH, _MASS, _TIME, _ANGLE = (0, 0, 0, 0), (1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1)
 _RATE, _FORCE, _TORQUE, _ACCELERATION = (0, 0, -1, 1), (1, 1, -2, 0), (2, 1, -2, 0), (1, 0, -2, 0)
-_SIZES = {
-    _NONE: {"1": 1.0},
+_UNIT_SIZES = {
+    _DIMENSIONLESS: {"1": 1.0},
     _LENGTH: {"m": 1.0, "km": 1e3, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254, "ft": 0.3048},
     _MASS: {"kg": 1.0, "g": 1e-3, "t": 1e3, "lb": 0.45359237},
     _TIME: {"s": 1.0, "ms": 1e-3, "us": 1e-6, "min": 60.0, "h": 3600.0},
@@ -139,7 +139,7 @@ _SIZES = {
     _FORCE: {"N": 1.0, "mN": 1e-3, "kN": 1e3, "MN": 1e6, "lbf": 4.4482216152605},
     _TORQUE: {"Nm": 1.0, "mNm": 1e-3, "kNm": 1e3, "Nmm": 1e-3, "Ncm": 1e-2},
 }
-_UNITS = {name: _Unit(size, dimension) for dimension, sizes in _SIZES.items() for name, size in sizes.items()}
+_UNITS = {name: _Unit(size, dimension) for dimension, sizes in _UNIT_SIZES.items() for name, size in sizes.items()}
 _GRAVITY = _Unit(9.80665, _ACCELERATION)  # "g" of an accelerometer; elsewhere "g" is a gram
 _SPELLINGS = {
     "°": "deg",
@@ -151,14 +151,14 @@ _SPELLINGS = {
     "**": "^",
     "*": " ",
 }
-_WORDS = {
+_UNIT_WORDS = {
     **dict.fromkeys(("degree", "degrees"), "deg"),
     **dict.fromkeys(("radian", "radians"), "rad"),
     **dict.fromkeys(("turn", "turns"), "rev"),
     **dict.fromkeys(("second", "seconds", "sec"), "s"),
     **dict.fromkeys(("meter", "meters", "metre", "metres"), "m"),
 }
-_USUAL = (
+_USUAL_UNITS = (
     "m, mm, cm",
     "rad, deg, rev",
     "s, ms",
@@ -176,7 +176,7 @@ _USUAL = (
 )
 
 
-QUANTITY = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*")  # a number and its unit
+QUANTITY_PATTERN = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*")  # a number and its unit
 
 
 def read_quantity(text: str, wanted: str) -> float:
@@ -185,7 +185,7 @@ def read_quantity(text: str, wanted: str) -> float:
     Raises:
         ValueError: it is not a number with a unit, or its unit is unknown or has another dimension.
     """
-    match = QUANTITY.fullmatch(text)
+    match = QUANTITY_PATTERN.fullmatch(text)
     if match is None:
         raise ValueError(f"must be a number, or a string with a number and its unit, not {quote(text)}")
     number, units = match.groups()
@@ -196,7 +196,7 @@ def read_quantity(text: str, wanted: str) -> float:
 
 def _usual_units(wanted: str) -> str:
     goal = _read(wanted)
-    return next((unit for unit in _USUAL if _read(unit.partition(",")[0]).dimension == goal.dimension), wanted)
+    return next((unit for unit in _USUAL_UNITS if _read(unit.partition(",")[0]).dimension == goal.dimension), wanted)
 
 
 def conversion_factor(units: str, wanted: str) -> float:
@@ -225,7 +225,7 @@ def dimension_of(units: str) -> tuple[int, ...]:
 
 def unit_sizes(wanted: str) -> dict[str, float]:
     """Return the size of each single unit with the dimension of `wanted`, an SI unit, by all spellings that are read."""
-    names = {*_UNITS, *_WORDS, *(name.replace(usual, spelling) for spelling, usual in _SPELLINGS.items() for name in _UNITS)}
+    names = {*_UNITS, *_UNIT_WORDS, *(name.replace(usual, spelling) for spelling, usual in _SPELLINGS.items() for name in _UNITS)}
     dimension = _read(wanted).dimension
     units = {name: _read(name) for name in sorted(names)}
     return {name: unit.size for name, unit in units.items() if unit.dimension == dimension}
@@ -238,7 +238,7 @@ def _read(text: str) -> _Unit:
         plain = plain.replace(spelling, usual)
     product = _UNITS["1"]
     for slash, name, power in re.findall(r"(/?)\s*([^\W\d]+|1)\^?(-?\d+)?|\S", plain):
-        name = _WORDS.get(name, name)
+        name = _UNIT_WORDS.get(name, name)
         if name not in _UNITS:
             suggestions = [f"; did you mean {quote(unit)}?" for unit in _UNITS if unit.lower() == f"{name}".lower()]
             suggestions += ["; cycles a second are rev/s"] if f"{name}".endswith("Hz") else []

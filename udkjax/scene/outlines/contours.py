@@ -8,8 +8,8 @@ from jaxtyping import Float
 
 from udkjax.scene.outlines.curves import Arc, Piece, corners, ends
 
-JOINED = 1e-6  # of the size of the drawing: ends nearer than this meet
-FINE = 1e-4  # of the size: chords by which crossings are looked for
+JOINING_TOL = 1e-6  # of the size of the drawing: ends nearer than this meet
+CROSSING_CHORD = 1e-4  # of the size: chords by which crossings are looked for
 
 
 class DrawnPiece(NamedTuple):
@@ -33,7 +33,7 @@ class Contour(NamedTuple):
             return None
         radii = np.array([[np.hypot(*x.x), np.hypot(*x.y)] for x in arcs])
         off = np.ptp([x.centre for x in arcs], axis=0).max()
-        return (arcs[0].centre, float(radii[0, 0])) if max(off, np.ptp(radii)) <= JOINED * radii[0, 0] else None
+        return (arcs[0].centre, float(radii[0, 0])) if max(off, np.ptp(radii)) <= JOINING_TOL * radii[0, 0] else None
 
     def polygon(self, chord: float) -> Float[np.ndarray, "n 2"]:
         """Return points in order whose chords are nearer to the contour than `chord`."""
@@ -54,7 +54,7 @@ def contours_of(drawn: Sequence[DrawnPiece], scale: float, unit: str) -> tuple[l
         scale: the file's unit (m).
         unit: the name of the file's unit.
     """
-    near, problems, found = JOINED * size_of_pieces(drawn), [], []
+    near, problems, found = JOINING_TOL * size_of_pieces(drawn), [], []
 
     def place(p: np.ndarray) -> str:
         return f"({p[0] / scale:.6g}, {p[1] / scale:.6g}) {unit}"
@@ -81,7 +81,7 @@ def contours_of(drawn: Sequence[DrawnPiece], scale: float, unit: str) -> tuple[l
             chain.append(following if np.hypot(*(ends(following)[0] - end)) <= near else following.reverse())
         found.append(Contour(tuple(chain), first.name))
     if not problems:
-        problems = _crossings(found, FINE * size_of_pieces(drawn), place)
+        problems = _crossings(found, CROSSING_CHORD * size_of_pieces(drawn), place)
     return found, problems
 
 

@@ -11,9 +11,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-NODES, WEIGHTS = (x / 2 for x in np.polynomial.legendre.leggauss(12))
-NODES = NODES + 0.5
-QUARTER = np.pi / 2
+GAUSS_NODES, GAUSS_WEIGHTS = (x / 2 for x in np.polynomial.legendre.leggauss(12))
+GAUSS_NODES = GAUSS_NODES + 0.5
+QUARTER_TURN = np.pi / 2
 
 
 class Bezier(NamedTuple):
@@ -51,7 +51,7 @@ class Arc(NamedTuple):
     @property
     def count(self) -> int:
         """The number of stretches that Gauss's rule integrates one by one."""
-        return max(1, int(np.ceil(abs(self.sweep) / QUARTER - 1e-9)))
+        return max(1, int(np.ceil(abs(self.sweep) / QUARTER_TURN - 1e-9)))
 
     def at(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return places and derivatives at parameters from 0 to 1."""
@@ -98,8 +98,8 @@ def corners(piece: Piece, chord: float) -> Float[np.ndarray, "n 2"]:
     """Return points of a piece from its start on, without its end, whose chords are nearer to it than `chord`."""
     if isinstance(piece, Arc):
         radius = max(np.hypot(*piece.x), np.hypot(*piece.y))
-        step = 2 * np.arccos(max(0.0, 1 - chord / radius)) if chord < radius else QUARTER
-        count = int(np.ceil(abs(piece.sweep) / min(step, QUARTER)))
+        step = 2 * np.arccos(max(0.0, 1 - chord / radius)) if chord < radius else QUARTER_TURN
+        count = int(np.ceil(abs(piece.sweep) / min(step, QUARTER_TURN)))
     elif len(piece.points) == 2:
         count = 1
     else:  # the chord is off by at most the largest second derivative times h^2 / 8
@@ -114,9 +114,9 @@ def moments(pieces: Sequence[Piece], about: Float[np.ndarray, "2"]) -> tuple[flo
     area, first, second = 0.0, np.zeros(2), 0.0
     for piece in pieces:
         for k in range(piece.count):
-            p, way = piece.at((k + NODES) / piece.count)
+            p, way = piece.at((k + GAUSS_NODES) / piece.count)
             p = p - about
-            cross = (p[:, 0] * way[:, 1] - p[:, 1] * way[:, 0]) * WEIGHTS / piece.count
+            cross = (p[:, 0] * way[:, 1] - p[:, 1] * way[:, 0]) * GAUSS_WEIGHTS / piece.count
             area += cross.sum() / 2
             first += cross @ p / 3
             second += cross @ (p * p).sum(1) / 4

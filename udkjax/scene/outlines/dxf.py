@@ -10,8 +10,8 @@ from udkjax.extras import OptionalImport
 from udkjax.scene.outlines.contours import DrawnPiece
 from udkjax.scene.outlines.curves import Arc, Bezier, Piece, bulge, circle, line
 
-UNITS = {1: "in", 2: "ft", 4: "mm", 5: "cm", 6: "m", 7: "km", 13: "um"}  # by the number in a file's header
-IGNORED = {"TEXT", "MTEXT", "DIMENSION", "POINT", "HATCH", "LEADER", "ATTDEF", "VIEWPORT"}
+UNIT_CODES = {1: "in", 2: "ft", 4: "mm", 5: "cm", 6: "m", 7: "km", 13: "um"}  # by the number in a file's header
+IGNORED_ENTITIES = {"TEXT", "MTEXT", "DIMENSION", "POINT", "HATCH", "LEADER", "ATTDEF", "VIEWPORT"}
 
 
 def read_dxf(path: str | os.PathLike[str], layers: tuple[str, ...] | None) -> tuple[list[DrawnPiece], str | None, list[str]]:
@@ -28,7 +28,7 @@ def read_dxf(path: str | os.PathLike[str], layers: tuple[str, ...] | None) -> tu
     drawn, problems = [], []
     for entity in recursive_decompose(file.modelspace()):
         layer, kind = entity.dxf.layer, entity.dxftype()
-        if kind in IGNORED or (layers is not None and layer not in layers):
+        if kind in IGNORED_ENTITIES or (layers is not None and layer not in layers):
             continue
         upright.upright(entity)  # pyright: ignore[reportArgumentType]
         pieces = _pieces(entity, kind)
@@ -37,7 +37,7 @@ def read_dxf(path: str | os.PathLike[str], layers: tuple[str, ...] | None) -> tu
             problems.append(f"{kind} in layer {layer!r} cannot be a part of a contour; {cure}")
         else:
             drawn += [DrawnPiece(piece, f"{kind} in layer {layer!r}") for piece in pieces]
-    return drawn, UNITS.get(file.units), problems
+    return drawn, UNIT_CODES.get(file.units), problems
 
 
 def _pieces(entity: Any, kind: str) -> list[Piece] | None:

@@ -10,7 +10,8 @@ from udkjax.scene.drawing.drawn_quantities import Units
 from udkjax.scene.outlines.outline import Outline, RoundHole
 from udkjax.wording import quote
 
-FITS = 1e-3  # of a hole's radius: distance of a pin from its centre, and difference of diameters, up to which they are the same
+# Of a hole's radius: distance of a pin from its centre, and difference of diameters, up to which they are the same.
+HOLE_TOL = 1e-3
 
 
 class HolePins:
@@ -36,7 +37,7 @@ class HolePins:
             diameter: diameter of the holes with pins (m); None for all round holes.
             problems: mistakes are added.
         """
-        holes = [x for x in outline.circles if diameter is None or abs(2 * x.radius - diameter) <= FITS * diameter]
+        holes = [x for x in outline.circles if diameter is None or abs(2 * x.radius - diameter) <= HOLE_TOL * diameter]
         if not holes:
             sizes = ", ".join(dict.fromkeys(self._units.text(2 * x.radius, "m") for x in outline.circles))
             wanted = (
@@ -58,7 +59,7 @@ class HolePins:
         for name, place in self._places.items():
             off = float(np.hypot(*(place - hole.centre)))
             if off < hole.radius:
-                if off > FITS * hole.radius:
+                if off > HOLE_TOL * hole.radius:
                     x, y = (format_number(x / self._units.size("m")) for x in hole.centre)
                     off_text, unit = self._units.text(off, "m"), self._units.shown("m")
                     problems.append(

@@ -19,7 +19,7 @@ from udkjax.scene.outlines.svg import read_svg
 from udkjax.scene.tables.checks import SceneError
 from udkjax.wording import quote
 
-CHORD = 1e-4  # of the square root of the area: the largest distance of a polygon from its outline, by default
+DEFAULT_CHORD = 1e-4  # of the square root of the area: the largest distance of a polygon from its outline, by default
 
 
 class RoundHole(NamedTuple):
@@ -62,14 +62,14 @@ class Outline(NamedTuple):
         """Return corners (m) of a polygon whose sides are nearer to the outer contour than `chord` (m)."""
         if chord is not None:
             require_number("chord", chord, "positive")
-        return self.outer.polygon(CHORD * float(np.sqrt(self.area)) if chord is None else float(chord))
+        return self.outer.polygon(DEFAULT_CHORD * float(np.sqrt(self.area)) if chord is None else float(chord))
 
     def hole_polygons(self, chord: float | None = None) -> Float[np.ndarray, "holes n 2"] | None:
         """Return corners (m) of polygons of the holes, the same number for each, since corners may be repeated.
 
         The sides are nearer to the holes than `chord` (m). The result is None if the outline has no holes.
         """
-        chord = CHORD * float(np.sqrt(self.area)) if chord is None else float(chord)
+        chord = DEFAULT_CHORD * float(np.sqrt(self.area)) if chord is None else float(chord)
         found = [hole.polygon(chord) for hole in self.holes]
         most = max(map(len, found), default=0)
         return np.stack([np.append(x, np.repeat(x[-1:], most - len(x), 0), 0) for x in found]) if found else None
@@ -184,7 +184,7 @@ def outline_of_contours(contours: Sequence[Contour], name: str) -> Outline:
     """Return the outline of one contour with holes; `name` is that of the file, for messages."""
     areas = [moments(x.pieces, x.polygon(np.inf)[0])[0] for x in contours]
     k = int(np.argmax(np.abs(areas)))
-    outer, fine = contours[k], contours[k].polygon(CHORD * float(np.sqrt(abs(areas[k]))))
+    outer, fine = contours[k], contours[k].polygon(DEFAULT_CHORD * float(np.sqrt(abs(areas[k]))))
     polygons = [x.polygon(np.inf) for x in contours]
     problems = []
     for j, contour in enumerate(contours):

@@ -16,7 +16,7 @@ from udkjax.scene.outlines.outline import Outline, read_outline
 from udkjax.scene.tables.checks import SceneError
 from udkjax.wording import abbreviate, quote, suggestion
 
-KEYS = "file", "unit", "layers", "chord", "pin"
+OUTLINE_KEYS = "file", "unit", "layers", "chord", "pin"
 FROM_AREA = {"density": "kg/m3", "thickness": "m"}  # with which the area gives a mass
 
 
@@ -83,7 +83,7 @@ def _read(
 ) -> tuple[_File, float | None] | None:
     """Return the outline of a file, and the diameter of its holes with pins (m); None, with problems, on failure."""
     given = outline if isinstance(outline, dict) else {"file": outline}
-    unknown = [f"{path}.outline.{key}: unknown key{suggestion(key, KEYS)}" for key in given if key not in KEYS]
+    unknown = [f"{path}.outline.{key}: unknown key{suggestion(key, OUTLINE_KEYS)}" for key in given if key not in OUTLINE_KEYS]
     if unknown or not isinstance(given.get("file"), str):
         problems += unknown or [f"{path}.outline: needs the name of a file, not {abbreviate(outline)}"]
         return None

@@ -10,8 +10,9 @@ from udkjax.extras import OptionalImport
 from udkjax.scene.outlines.contours import DrawnPiece
 from udkjax.scene.outlines.curves import Arc, Bezier, Piece, line
 
-MILLIMETRES = {"mm": 1.0, "cm": 10.0, "in": 25.4, "pt": 25.4 / 72, "pc": 25.4 / 6}  # units of widths that give the file a unit
-PIXELS = 96.0  # per inch, as CSS has it
+# Units of widths that give the file a unit.
+MILLIMETRES_PER_UNIT = {"mm": 1.0, "cm": 10.0, "in": 25.4, "pt": 25.4 / 72, "pc": 25.4 / 6}
+PIXELS_PER_INCH = 96.0  # per inch, as CSS has it
 
 
 def read_svg(path: str | os.PathLike[str]) -> tuple[list[DrawnPiece], str | None, list[str]]:
@@ -24,14 +25,17 @@ def read_svg(path: str | os.PathLike[str]) -> tuple[list[DrawnPiece], str | None
     from xml.etree.ElementTree import ParseError
 
     try:
-        file = svg.SVG.parse(os.fspath(path), reify=True, ppi=PIXELS)
+        file = svg.SVG.parse(os.fspath(path), reify=True, ppi=PIXELS_PER_INCH)
     except (ParseError, ValueError) as error:
         return [], None, [f"not an SVG file that can be read: {error}"]
     width = str(file.values.get("attributes", {}).get("width", ""))
     physical = re.fullmatch(r"\s*([\d.eE+-]+)\s*([a-z]+)\s*", width)
     own, scale = None, np.array([1.0, -1.0])
-    if physical is not None and physical[2] in MILLIMETRES:  # svgelements rounds its factors
-        own, scale = "mm", scale * float(physical[1]) * MILLIMETRES[physical[2]] / svg.Length(width).value(ppi=PIXELS)
+    if physical is not None and physical[2] in MILLIMETRES_PER_UNIT:  # svgelements rounds its factors
+        own, scale = (
+            "mm",
+            scale * float(physical[1]) * MILLIMETRES_PER_UNIT[physical[2]] / svg.Length(width).value(ppi=PIXELS_PER_INCH),
+        )
     drawn, problems = [], []
     for shape in file.select(lambda x: isinstance(x, svg.Shape)):
         name = f"{type(shape).__name__.lower()} {shape.id!r}" if shape.id else type(shape).__name__.lower()

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from udkjax.annotations import JsonObject, Numbers
 from udkjax.argument_types import COORDINATES_OF_BODIES, require_history
 from udkjax.equations.systems.general import ConstrainedSystem
-from udkjax.extras import WRITERS, require
+from udkjax.extras import WRITING_PACKAGES, require
 from udkjax.integrate.events.law.conditions import Gap
 from udkjax.integrate.events.law.event import EventsLike, ExpandsToEvents, expand_events, listed_events
 from udkjax.integrate.simulate import simulate
@@ -109,7 +109,7 @@ class Animation:
         """
         path = Path(path)
         kind = path.suffix.lower()
-        require(*WRITERS.get(kind, ()))
+        require(*WRITING_PACKAGES.get(kind, ()))
         if kind == ".html":
             path.write_text(self.html(**options), encoding="utf-8")
         elif kind == ".svg":

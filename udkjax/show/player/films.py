@@ -13,7 +13,7 @@ from udkjax.show.player.pictures import Posed, sketches
 with OptionalImport():
     from PIL import Image, ImageDraw, ImageFont
 
-SMOOTH = 3  # factor by which pictures are drawn larger and then reduced, to smooth edges
+OVERSAMPLING = 3  # factor by which pictures are drawn larger and then reduced, to smooth edges
 MOST_FRAMES = 1500  # largest number of frames of a film
 SAME_COLOUR = 8  # largest difference (of 255) of colours that count as the background
 GIF_TICK = 0.01  # unit of a GIF's frame times (s)
@@ -21,7 +21,7 @@ GIF_TICK = 0.01  # unit of a GIF's frame times (s)
 
 def image(animation: Posed, t: float | None = None, width: int = 640, theme: str = "light", labels: bool = False) -> Image.Image:
     """Return one pose of each run, side by side, as a bitmap of about `width` px; t is the time (s), by default the start."""
-    view, sketches_at_t = sketches(animation, t, width, theme, SMOOTH, labels)
+    view, sketches_at_t = sketches(animation, t, width, theme, OVERSAMPLING, labels)
     large = Image.new("RGB", (view.width * len(sketches_at_t), view.height), THEMES[theme]["back"])
     for k, sketch in enumerate(sketches_at_t):
         panel = Image.new("RGB", (view.width, view.height), THEMES[theme]["back"])
@@ -32,7 +32,7 @@ def image(animation: Posed, t: float | None = None, width: int = 640, theme: str
             else:
                 _paint(draw, shape)
         large.paste(panel, (k * view.width, 0))
-    small = large.width // SMOOTH // 2 * 2, large.height // SMOOTH // 2 * 2  # MP4 needs even sizes
+    small = large.width // OVERSAMPLING // 2 * 2, large.height // OVERSAMPLING // 2 * 2  # MP4 needs even sizes
     return large.resize(small, Image.Resampling.LANCZOS)
 
 

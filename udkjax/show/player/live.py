@@ -25,7 +25,7 @@ from udkjax.show.player.marks.measure_curves import ShownMotion
 from udkjax.show.player.marks.symbol_updates import symbol_updates
 from udkjax.show.player.player_data import MOST_INSTANTS
 
-TOLERANCE = 1e-8  # rtol and atol of a run that does not record its tolerances: the defaults of `simulate`
+DEFAULT_TOL = 1e-8  # rtol and atol of a run that does not record its tolerances: the defaults of `simulate`
 SAME_STATE = 1e-6  # tolerance (characteristic lengths or rad, per characteristic time) for an initial state to be the scene's
 
 
@@ -51,7 +51,7 @@ def live_data(
         _require_solvable(mechanism, solution, events)
         run_sliders = sliders_of(mechanism, unknown or names_in(mechanism, live))
         sliders = {slider.name: slider for slider in run_sliders} | sliders
-        rtol, atol = (float(getattr(solution, name, TOLERANCE)) for name in ("rtol", "atol"))
+        rtol, atol = (float(getattr(solution, name, DEFAULT_TOL)) for name in ("rtol", "atol"))
         key = id(mechanism), rtol, atol
         if key not in engines:
             engines[key] = len(engines)

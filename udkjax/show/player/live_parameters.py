@@ -17,7 +17,7 @@ from udkjax.scene.numbers.units import conversion_factor
 # Names of parameters or of their entries, alone or with the ranges of their sliders; True: all parameters.
 Live = bool | Sequence[str] | Mapping[str, tuple[float, float] | None]
 
-SECTIONS = {
+SECTION_TITLES = {
     "motor": "Motors",
     "driver": "Drivers",
     "gravity": "Gravity",
@@ -32,12 +32,12 @@ SECTIONS = {
     "body": "Bodies",
     "link": "Links",
 }  # sections in order; further ones follow
-PLACES = ("points", "point", "position", "velocity", "vector", "gravity", "force")  # fields whose two entries are x and y
+PLACE_FIELDS = ("points", "point", "position", "velocity", "vector", "gravity", "force")  # fields whose two entries are x and y
 NOT_NEGATIVE = ("kg", "kg m2", "kg/m3", "N/m", "N s/m", "N m/rad", "N m s/rad")  # units of quantities that are never negative
-INITIAL = "Initial state"
+INITIAL_SECTION = "Initial state"
 # Initial values; position and angle of bodies, from which assembly starts, are added to these.
 INITIAL_FIELDS = ("velocity", "angular_velocity")
-SIZES = ("length", "radius", "width", "thickness", "radii")  # lengths that are never negative; all others are places
+SIZE_FIELDS = ("length", "radius", "width", "thickness", "radii")  # lengths that are never negative; all others are places
 LEAST_VALUE = 1e-9  # values below this count as zero, relative to the scene's units
 LARGEST_GRAVITY = 20.0  # twice that of the earth (m/s2)
 
@@ -89,7 +89,7 @@ def sliders_of(mechanism: Mechanism, live: Live) -> list[Slider]:
             raise ValueError(f"live: the range {low:g} to {high:g} of {name} does not contain its value {value:g}")
         shown = written.shown(unit)
         per_unit = 1.0 / conversion_factor(shown, unit) if shown != unit else 1.0
-        label, section = links.get(name) or label_of(name), SECTIONS["length"] if name in links else section_of(name)
+        label, section = links.get(name) or label_of(name), SECTION_TITLES["length"] if name in links else section_of(name)
         sliders.append(Slider(name, label, section, unit, value, float(low), float(high), shown, per_unit))
     return in_sections(sliders)
 
@@ -137,7 +137,7 @@ def pins_in_line(mechanism: Mechanism) -> set[str]:
 
 def in_sections(sliders: Iterable[Slider]) -> list[Slider]:
     """Return sliders in the order of their sections."""
-    order = [*dict.fromkeys(SECTIONS.values())]
+    order = [*dict.fromkeys(SECTION_TITLES.values())]
     return sorted(sliders, key=lambda slider: order.index(slider.section) if slider.section in order else len(order))
 
 
@@ -156,8 +156,8 @@ def section_of(name: str) -> str:
     parts = _base(name).split(".")
     section, field = parts[0], parts[-1]
     if field in INITIAL_FIELDS or (section == "body" and field in ("position", "angle")):
-        return INITIAL
-    return SECTIONS.get(section, f"{section.capitalize()}s")
+        return INITIAL_SECTION
+    return SECTION_TITLES.get(section, f"{section.capitalize()}s")
 
 
 def label_of(name: str) -> str:
@@ -168,7 +168,7 @@ def label_of(name: str) -> str:
     text = " ".join(words).replace("_", " ")
     if parts[-1] in ("points", "radii", "times", "values") and indices:
         text = f"{text.removesuffix('s') if parts[-1] == 'points' else text} {indices.pop(0) + 1}"
-    in_plane = parts[-1] in PLACES or (parts[0] == "pin" and parts[2:] != ["length"])
+    in_plane = parts[-1] in PLACE_FIELDS or (parts[0] == "pin" and parts[2:] != ["length"])
     text += "".join(f" {'xy'[k]}" if in_plane and k < 2 else f" {k + 1}" for k in indices)
     text_words = text.split(" ")
     return " ".join(word for k, word in enumerate(text_words) if k == 0 or word != text_words[k - 1])  # not "motor motor speed"
@@ -188,7 +188,7 @@ def usual_range(name: str, unit: str, value: float, length: float, rate: float) 
     size = abs(value) if abs(value) > LEAST_VALUE * by_unit.get(unit, 0.0) else 0.0
     if unit == "m/s2":
         return -max(LARGEST_GRAVITY, 2 * size), max(LARGEST_GRAVITY, 2 * size)
-    if unit in NOT_NEGATIVE or (unit == "m" and re.split(r"[.\[]", name)[-2 if "[" in name else -1] in SIZES):
+    if unit in NOT_NEGATIVE or (unit == "m" and re.split(r"[.\[]", name)[-2 if "[" in name else -1] in SIZE_FIELDS):
         return (size / 10, 4 * size) if size else (0.0, length if unit == "m" else 1.0)
     if unit == "m":
         return value - 0.5 * length, value + 0.5 * length

@@ -10,11 +10,22 @@ from string import Template
 from udkjax.annotations import JsonObject
 
 # Modules of the player; each follows those that it imports.
-SHOWING = ("motion", "labels", "painter", "symbols", "strip", "style", "elements", "event_marks", "pointers")
-GAPS = ("gap_marks",)  # of pages that show gaps between links
+PLAYER_MODULES = ("motion", "labels", "painter", "symbols", "strip", "style", "elements", "event_marks", "pointers")
+GAP_MODULES = ("gap_marks",)  # of pages that show gaps between links
 # Modules of live pages only.
-SOLVING = ("events", "engine", "symbol_updates", "hand", "sliders", "address", "part_run", "pin_measures", "live_run", "live")
-LAST = ("player", "mount")
+LIVE_MODULES = (
+    "events",
+    "engine",
+    "symbol_updates",
+    "hand",
+    "sliders",
+    "address",
+    "part_run",
+    "pin_measures",
+    "live_run",
+    "live",
+)
+LAST_MODULES = ("player", "mount")
 # Characters that could end a <script>, begin markup, or break a line of JavaScript.
 ESCAPES = {ord(c): f"\\u{ord(c):04x}" for c in "<>&\u2028\u2029"}
 
@@ -49,7 +60,7 @@ def module(is_live: bool = True, has_gaps: bool = True) -> str:
     Half of the source are modules that only a live page needs; they are left out of other pages. So are modules that show gaps,
     if a page has none.
     """
-    names = (*SHOWING, *(GAPS if has_gaps else ()), *(SOLVING if is_live else ()), *LAST)
+    names = (*PLAYER_MODULES, *(GAP_MODULES if has_gaps else ()), *(LIVE_MODULES if is_live else ()), *LAST_MODULES)
     *sources, last = (files("udkjax.show.player").joinpath(f"{name}.js").read_text(encoding="utf-8") for name in names)
     joined = "\n".join([*(re.sub(r"^export ", "", source, flags=re.M) for source in sources), last])
     return re.sub(r"^(import .*| *//.*)?\n", "", joined, flags=re.M)

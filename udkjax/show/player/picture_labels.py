@@ -15,12 +15,12 @@ from udkjax.text_places import Box, TextPlaces
 Anchor = tuple[int, float, float]  # a place of a body, by its index; -1 is the ground
 Pixels = Float[np.ndarray, "2"]
 
-SIZE = 12.0  # height of letters; all lengths are in units of symbols
-PIN = 7.0  # half of the side of the square around a pin that texts keep clear
-LEVELS = (17.0, 31.0, 45.0)  # distances from a link to its dimension line, the best first
-ABOVE = 8.0  # distance from a dimension line to the middle of its text
-ARROW, ARROW_WIDTH = 7.0, 2.0  # length and half of the width of an arrow
-GAP, BEYOND = 6.0, 4.0  # of an extension line: from the point, and beyond the dimension line
+LETTER_HEIGHT = 12.0  # height of letters; all lengths are in units of symbols
+PIN_CLEARANCE = 7.0  # half of the side of the square around a pin that texts keep clear
+DIMENSION_LEVELS = (17.0, 31.0, 45.0)  # distances from a link to its dimension line, the best first
+TEXT_OFFSET = 8.0  # distance from a dimension line to the middle of its text
+ARROW_LENGTH, ARROW_WIDTH = 7.0, 2.0  # length and half of the width of an arrow
+EXTENSION_GAP, EXTENSION_BEYOND = 6.0, 4.0  # of an extension line: from the point, and beyond the dimension line
 
 
 class LinkDimension(NamedTuple):
@@ -80,13 +80,15 @@ class Placing:
 
     def __init__(self, labels: PictureLabels, sketch: Sketch):
         self.sketch, self.pt = sketch, sketch.view.pt
-        self.size = SIZE * self.pt
+        self.size = LETTER_HEIGHT * self.pt
         self.points = {name: sketch.anchor(*anchor) for name, anchor in labels.names.items()}
         ends = [(d.words, sketch.anchor(*d.start), sketch.anchor(*d.end)) for d in labels.dimensions]
-        pins = [(place, *(PIN * self.pt * np.eye(2))) for place in self.points.values()]
+        pins = [(place, *(PIN_CLEARANCE * self.pt * np.eye(2))) for place in self.points.values()]
         bars = [(start, end) for _, start, end in ends]
         self.texts = TextPlaces(sketch.view.width, sketch.view.height, self.size, pins, bars)
-        self.dimensions = [self._dimension(*entry) for entry in ends if np.hypot(*(entry[2] - entry[1])) > 2 * PIN * self.pt]
+        self.dimensions = [
+            self._dimension(*entry) for entry in ends if np.hypot(*(entry[2] - entry[1])) > 2 * PIN_CLEARANCE * self.pt
+        ]
         self.names = [self._name(name, place) for name, place in self.points.items()]
 
     def shapes(self) -> list[Line | Text]:
@@ -103,9 +105,9 @@ class Placing:
         half = (self.texts.width(words) / 2 * along, self.size / 2 * left)
 
         def box(off: float) -> Box:
-            return middle + (off + np.sign(off) * ABOVE * self.pt) * left, *half
+            return middle + (off + np.sign(off) * TEXT_OFFSET * self.pt) * left, *half
 
-        offs = [side * level * self.pt for level in LEVELS for side in sides]
+        offs = [side * level * self.pt for level in DIMENSION_LEVELS for side in sides]
         off = self.texts.cheapest(offs, box, own, lambda off: [start + off * left, end + off * left])
         self.texts.boxes.append(box(off))
         self.texts.lines.append((start + off * left, end + off * left))
@@ -124,12 +126,12 @@ class Placing:
         a, b = start + off * left, end + off * left
         found: list[Line | Text] = [Line("dimension", np.array([a, b]), 0.9 * pt, colour)]
         for foot, tip, inwards in ((start, a, along), (end, b, -along)):
-            reach = np.array([foot + side * GAP * pt * left, tip + side * BEYOND * pt * left])
-            head = min(ARROW * pt, length / 4)
-            corners = [tip, *(tip + head * inwards + s * head * ARROW_WIDTH / ARROW * left for s in (1, -1))]
+            reach = np.array([foot + side * EXTENSION_GAP * pt * left, tip + side * EXTENSION_BEYOND * pt * left])
+            head = min(ARROW_LENGTH * pt, length / 4)
+            corners = [tip, *(tip + head * inwards + s * head * ARROW_WIDTH / ARROW_LENGTH * left for s in (1, -1))]
             found += [Line("dimension", reach, 0.7 * pt, colour)]
             found += [Line("dimension", np.array(corners), 0.0, "", colour, True)]
-        place = (a + b) / 2 + side * ABOVE * pt * left
+        place = (a + b) / 2 + side * TEXT_OFFSET * pt * left
         angle = float(np.degrees(np.arctan2(-along[1], along[0])))
         upright = angle if -90.0 < round(angle, 6) <= 90.0 else angle - 180.0 * np.sign(angle)
         return [*found, Text("dimension", place, words, self.size, colour, upright)]

@@ -12,7 +12,7 @@ from udkjax.extras import OptionalImport
 from udkjax.show.player.marks.mark_kinds import MarkKind
 from udkjax.show.player.marks.sketch import (
     THEMES,
-    TOUCHING,
+    TOUCHING_LAYER,
     Circle,
     ForceArrow,
     Line,
@@ -141,7 +141,7 @@ def save_dxf(animation: Posed, path: Path, t: float | None = None, labels: bool 
     if labels:
         _label(drawing, Placing(animation.labels()[0], panels[0]), view)
     for shape in panels[0].shapes:
-        if isinstance(shape, Text) or shape.layer == TOUCHING:  # an area without lines
+        if isinstance(shape, Text) or shape.layer == TOUCHING_LAYER:  # an area without lines
             continue
         layer = DXF_LAYERS.get(shape.layer, f"{shape.layer}s")
         if layer not in drawing.layers:

@@ -40,7 +40,7 @@ from udkjax.show.player.marks.mark_kinds import MarkKind
 from udkjax.show.player.marks.mark_places import body_points, to_ground
 from udkjax.show.player.marks.marks import BodyPoints, marks
 from udkjax.show.player.marks.measure_curves import Measures, ShownMotion, measures_of, reaction_arrows, sticking_spans
-from udkjax.show.player.marks.sketch import POINT, ForceArrow, TracedPath, view_of
+from udkjax.show.player.marks.sketch import UNIT_PICTURE_SIDE, ForceArrow, TracedPath, view_of
 from udkjax.show.player.marks.symbols import symbols_of
 from udkjax.show.player.packing import floats, pack, unpack
 
@@ -53,7 +53,7 @@ USUAL_FORCE_QUANTILE = 0.95  # fraction of instants at which no joint force exce
 MOST_INSTANTS = 2400  # number per run; a longer run is thinned out evenly, and interpolated with its velocities
 MOST_TRACES = 8  # further traces would hide the mechanism
 COMFORTABLE_DURATIONS = (4.0, 40.0)  # range of the playing time (s) at the default speed
-SPEEDS = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
+PLAYBACK_SPEEDS = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
 MODE_PERIOD = 2.0  # playing time of one cycle of a mode (s)
 MODE_AMPLITUDE = 0.12  # amplitude of a shown mode, in characteristic lengths or rad
 PATH_POINTS, MOST_PATH_POINTS = 4, 3000  # points of a path per instant of its run, and their largest number
@@ -240,7 +240,7 @@ def player_data(title: str, runs: Sequence[tuple[Mechanism, Record, Float[np.nda
     start, end = min(first for first, _ in ends), max(last for _, last in ends)
     boxes = np.array([_box(mechanism, record, poses) for mechanism, record, poses in runs])
     bounds = [*boxes[:, :2].min(axis=0).tolist(), *boxes[:, 2:].max(axis=0).tolist()]
-    view = view_of(bounds, int(POINT))
+    view = view_of(bounds, int(UNIT_PICTURE_SIDE))
     return {
         "format": 1,
         "title": title,
@@ -335,8 +335,8 @@ def _speed(duration: float) -> float:
     if duration <= 0 or shortest <= duration <= longest:
         return 1.0
     if duration < shortest:
-        return max((s for s in SPEEDS if s <= 1 and duration / s >= shortest), default=SPEEDS[0])
-    return min((s for s in SPEEDS if s >= 1 and duration / s <= longest), default=SPEEDS[-1])
+        return max((s for s in PLAYBACK_SPEEDS if s <= 1 and duration / s >= shortest), default=PLAYBACK_SPEEDS[0])
+    return min((s for s in PLAYBACK_SPEEDS if s >= 1 and duration / s <= longest), default=PLAYBACK_SPEEDS[-1])
 
 
 def failure_of(solution: ShownMotion) -> str:

@@ -20,21 +20,22 @@ from scipy.special import ndtri
 
 from udkjax.study.identify.density.log_density import InferenceProblem
 
-DRAWS = 25  # number of draws in a chunk, between which tuning, storing and interruptions take place
-LENGTH, LENGTHS = np.pi / 2, (0.6, 1.4)  # of trajectories for unit covariance, and the range of its random factor
+DRAWS_PER_CHUNK = 25  # number of draws in a chunk, between which tuning, storing and interruptions take place
+# Of trajectories for unit covariance, and the range of its random factor.
+TRAJECTORY_LENGTH, LENGTH_FACTORS = np.pi / 2, (0.6, 1.4)
 STEP_FACTORS = 0.8, 1.0  # range of the random factor of a step, which avoids periods of a trajectory that are multiples of it
 FIRST_STEP, LARGEST_STEP = 0.5, 1.5  # for unit covariance; leapfrog is unstable from 2
-DIVERGENT = 1000.0  # error of the energy of a trajectory that has left the density
+DIVERGENT_ERROR = 1000.0  # error of the energy of a trajectory that has left the density
 MOST_STEPS = 256  # largest number of steps of a trajectory
-ACCEPTANCE = 0.8  # mean acceptance to which the step is tuned
+TARGET_ACCEPTANCE = 0.8  # mean acceptance to which the step is tuned
 ACCEPTANCE_RANGE = 0.01, 0.995  # means beyond say only that the step is far too large or small
 STEP_CHANGE = 0.3, 1.5  # limits of the ratio of successive steps
 PRIOR_DRAWS = 1.0  # weight of the previous covariance in the next one, in draws for each unknown
 
 
 LINEAR_DEVIATION = 0.5  # deviation of a logarithm below which the number itself is the coordinate; two of these do not reach zero
-SOFT = 0.1  # ratio to the mode below which such a coordinate turns into a logarithm, so that the number stays positive
-LEAST = -600.0  # least coordinate, relative to SOFT, whose exponential is not rounded to zero
+SOFT_RATIO = 0.1  # ratio to the mode below which such a coordinate turns into a logarithm, so that the number stays positive
+LEAST_EXPONENT = -600.0  # least coordinate, relative to SOFT_RATIO, whose exponential is not rounded to zero
 
 
 class ChainCoordinates(NamedTuple):
@@ -53,19 +54,19 @@ class ChainCoordinates(NamedTuple):
 
     def x(self, w: Any, xp: Any = np) -> Any:
         """Return the unconstrained vectors x at coordinates w, both (..., K), by NumPy or, with `xp` `jax.numpy`, by JAX."""
-        y = xp.maximum(xp.where(self.linear, w, SOFT) / SOFT, LEAST)
-        return self.mode + xp.where(self.linear, xp.log(SOFT * xp.logaddexp(y, 0.0)), w)
+        y = xp.maximum(xp.where(self.linear, w, SOFT_RATIO) / SOFT_RATIO, LEAST_EXPONENT)
+        return self.mode + xp.where(self.linear, xp.log(SOFT_RATIO * xp.logaddexp(y, 0.0)), w)
 
     def log_slope(self, w: Any) -> Any:
         """Return the logarithm of the determinant of dx/dw at coordinates w (K,), by JAX."""
-        y = jnp.maximum(jnp.where(self.linear, w, SOFT) / SOFT, LEAST)
-        slopes = -jnp.logaddexp(0.0, -y) - jnp.log(SOFT * jnp.logaddexp(y, 0.0))
+        y = jnp.maximum(jnp.where(self.linear, w, SOFT_RATIO) / SOFT_RATIO, LEAST_EXPONENT)
+        slopes = -jnp.logaddexp(0.0, -y) - jnp.log(SOFT_RATIO * jnp.logaddexp(y, 0.0))
         return jnp.sum(jnp.where(self.linear, slopes, 0.0))
 
     def w(self, x: Float[np.ndarray, "... K"]) -> Float[np.ndarray, "... K"]:
         """Return the coordinates w of unconstrained vectors x."""
         ratio = np.exp(np.where(self.linear, x - self.mode, 0.0))
-        return np.where(self.linear, ratio + SOFT * np.log(-np.expm1(-ratio / SOFT)), x - self.mode)
+        return np.where(self.linear, ratio + SOFT_RATIO * np.log(-np.expm1(-ratio / SOFT_RATIO)), x - self.mode)
 
 
 def coordinates_of(
@@ -109,9 +110,16 @@ class Randomness(NamedTuple):
             shape: numbers of chains and of unknowns (C, K).
         """
         random = np.random.default_rng([seed, k])
-        size = step * random.uniform(*STEP_FACTORS, DRAWS)
-        steps = np.clip(np.round(LENGTH * random.uniform(*LENGTHS, DRAWS) / size), 1, MOST_STEPS).astype(int)
-        return cls(random.standard_normal((DRAWS, *shape)), -random.standard_exponential((DRAWS, shape[0])), steps, size)
+        size = step * random.uniform(*STEP_FACTORS, DRAWS_PER_CHUNK)
+        steps = np.clip(
+            np.round(TRAJECTORY_LENGTH * random.uniform(*LENGTH_FACTORS, DRAWS_PER_CHUNK) / size), 1, MOST_STEPS
+        ).astype(int)
+        return cls(
+            random.standard_normal((DRAWS_PER_CHUNK, *shape)),
+            -random.standard_exponential((DRAWS_PER_CHUNK, shape[0])),
+            steps,
+            size,
+        )
 
 
 class ChainState(NamedTuple):
@@ -166,7 +174,7 @@ def compile_draws(problem: InferenceProblem) -> Callable[..., tuple[ChainState, 
             chosen = lambda x, old: jnp.where(accepted.reshape(-1, *[1] * (x.ndim - 1)), x, old)  # noqa: E731
             after = jax.tree.map(chosen, proposal, state)
             found = {"position": after.position, "logdensity": after.logdensity, "acceptance": jnp.exp(jnp.minimum(gain, 0.0))}
-            return after, found | {"failed": failed, "divergent": ~failed & (gain < -DIVERGENT)}
+            return after, found | {"failed": failed, "divergent": ~failed & (gain < -DIVERGENT_ERROR)}
 
         end, found = jax.lax.scan(draw, ChainState(*map(jnp.asarray, state)), randomness)
         found["log_density"] = found.pop("logdensity") - jax.vmap(jax.vmap(coordinates.log_slope))(found["position"])
@@ -186,7 +194,7 @@ def tuned(first: Tuning, warmup: Sequence[DrawChunk]) -> Tuning:
     for k in range(1, len(warmup) + 1):
         previous = tunings[-1]
         mean = np.clip(warmup[k - 1]["acceptance"].mean(), *ACCEPTANCE_RANGE)
-        change = np.clip(np.sqrt(ndtri(1.0 - ACCEPTANCE / 2) / ndtri(1.0 - mean / 2)), *STEP_CHANGE)
+        change = np.clip(np.sqrt(ndtri(1.0 - TARGET_ACCEPTANCE / 2) / ndtri(1.0 - mean / 2)), *STEP_CHANGE)
         step = min(float(previous.step * change), LARGEST_STEP)
         w = np.concatenate([chunk["position"].reshape(-1, len(previous.covariance)) for chunk in warmup[k // 2 : k]])
         covariance = covariance_of(previous.covariance, w) if k > 1 else previous.covariance

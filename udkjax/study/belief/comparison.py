@@ -26,9 +26,10 @@ from udkjax.study.identify.density.log_density import InferenceProblem
 from udkjax.study.identify.records.records import IdentificationError
 from udkjax.wording import join_names, quote
 
-DRAWS = 1024  # largest number of draws from which the prediction of each value is computed
-EQUAL = np.log(2.0)  # weights with a smaller log ratio of the largest to the mean have a reliable mean, whatever their tail
-DECIDED = 0.95  # probability from which a model counts as the right one
+MOST_DRAWS = 1024  # largest number of draws from which the prediction of each value is computed
+# Weights with a smaller log ratio of the largest to the mean have a reliable mean, whatever their tail.
+EQUAL_LOG_RATIO = np.log(2.0)
+DECIDED_PROBABILITY = 0.95  # probability from which a model counts as the right one
 LEAST_ERRORS = 2.0  # number of standard errors from which two predictions differ
 
 ComparedModel: TypeAlias = InferenceProblem | Estimate | Laplace | Posterior
@@ -73,7 +74,7 @@ class Comparison(NamedTuple):
     def decided(self) -> bool:
         """True if the best model has a probability of 95 %, or predicts better than any other by two standard errors."""
         if self.by == "evidence":
-            return bool(self.probabilities[0] >= DECIDED)
+            return bool(self.probabilities[0] >= DECIDED_PROBABILITY)
         return bool(np.all(self.differences[1:] < -LEAST_ERRORS * self.difference_errors[1:]))
 
     @property
@@ -176,14 +177,14 @@ def _left_out(model: Laplace | Posterior) -> tuple[Float[np.ndarray, "R"], float
     """Return the log density of each measured value, predicted from all others, and the largest exponent of the weights (k)."""
     if isinstance(model, Posterior):
         x = model.x.reshape(-1, model.x.shape[2])
-        x, weights = x[:: -(-len(x) // DRAWS)], 0.0
+        x, weights = x[:: -(-len(x) // MOST_DRAWS)], 0.0
     else:
         x, weights = model.trials, model.log_weights - np.logaddexp.reduce(model.log_weights)
     compiled = model.problem.compiled("likelihoods", lambda problem, x: jax.vmap(problem.log_likelihoods)(x))
     likelihoods = np.asarray(compiled(x)).T
     inverse = weights - np.where(np.isfinite(weights), likelihoods, 0.0)
     each = np.logaddexp.reduce(np.broadcast_to(weights, len(x))) - np.logaddexp.reduce(inverse, axis=1)
-    rest = inverse[inverse.max(1) > np.logaddexp.reduce(inverse, axis=1) - np.log(len(x)) + EQUAL]
+    rest = inverse[inverse.max(1) > np.logaddexp.reduce(inverse, axis=1) - np.log(len(x)) + EQUAL_LOG_RATIO]
     return each, max(map(pareto_exponent, rest), default=-np.inf)
 
 

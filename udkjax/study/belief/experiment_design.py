@@ -37,7 +37,7 @@ from udkjax.study.identify.problem.unknowns import INVISIBLE_RATIO
 from udkjax.study.identify.records.records import ChannelKey, IdentificationError, Noise, Record, Start
 from udkjax.wording import suggestion
 
-DRAWS = 32  # draws whose mean criterion ranks candidates: it then varies by a fifth of its deviation from draw to draw
+RANKING_DRAWS = 32  # draws whose mean criterion ranks candidates: it then varies by a fifth of its deviation from draw to draw
 
 Criterion = Literal["D", "A", "E"]
 
@@ -164,7 +164,7 @@ def design_experiment(
     wanted = _select_parameters(names, of)
     drawn = _places(problem, given)
     prior_rows = _covariance_rows(drawn) if isinstance(given, Posterior) else _prior_information(problem, given)
-    places = drawn[np.linspace(0, len(drawn) - 1, min(DRAWS, len(drawn))).round().astype(int)]
+    places = drawn[np.linspace(0, len(drawn) - 1, min(RANKING_DRAWS, len(drawn))).round().astype(int)]
     dx_dz = problem.unknowns.dx_dz(places)[:, wanted]
     tols = float(tol), float(tol)
     # Roots of the information of each record, at each place.

@@ -16,11 +16,11 @@ from udkjax.study.identify.density.log_density import InferenceProblem
 from udkjax.study.report import format_value
 from udkjax.wording import join_names, plural
 
-INTERVAL = 0.03, 0.97  # quantiles at the ends of an interval
+INTERVAL_QUANTILES = 0.03, 0.97  # quantiles at the ends of an interval
 MOST_RHAT = 1.01  # largest R-hat of chains that agree
 LEAST_EFFECTIVE = 100  # least number of effective draws of a chain, for which R-hat and quantiles are reliable
-PREDICTIONS = 400  # number of draws that show the range of predictions: its ends have errors of a tenth of the noise
-EFFECTIVE: tuple[dict[str, Any], ...] = {"method": "bulk"}, {"method": "tail", "prob": (0.05, 0.95)}
+PREDICTION_DRAWS = 400  # number of draws that show the range of predictions: its ends have errors of a tenth of the noise
+EFFECTIVE_SIZES: tuple[dict[str, Any], ...] = {"method": "bulk"}, {"method": "tail", "prob": (0.05, 0.95)}
 MOST_BAD = 0.01  # share of divergent or failed proposals above which it is reported
 # R-hat and effective numbers: A. Vehtari et al., Rank-normalization, folding, and localization: an improved R-hat, Bayesian
 # Analysis 16 (2021) 667.
@@ -108,8 +108,8 @@ class Posterior:
             values, x = self.draws[name], np.ascontiguousarray(self.x[..., k])
             moves = bool(np.all(np.ptp(x, axis=1) > 0.0)) and x.shape[1] >= 4
             rhat = float(arviz.rhat(x)) if moves and len(x) > 1 else np.nan
-            bulk, tail = (float(arviz.ess(x, **of)) if moves else np.nan for of in EFFECTIVE)
-            low, high = np.quantile(values, INTERVAL).tolist()
+            bulk, tail = (float(arviz.ess(x, **of)) if moves else np.nan for of in EFFECTIVE_SIZES)
+            low, high = np.quantile(values, INTERVAL_QUANTILES).tolist()
             unit = self.problem.units[k]
             rows.append(PosteriorRow(name, float(values.mean()), float(values.std()), low, high, rhat, bulk, tail, unit))
         return tuple(rows)
@@ -175,7 +175,9 @@ class Posterior:
         older: Any = arviz
         return older.InferenceData(**groups) if arviz.__version__.startswith("0.") else xarray.DataTree.from_dict(groups)
 
-    def prediction_intervals(self, draws: int = PREDICTIONS, seed: int = 0) -> tuple[dict[str, Float[np.ndarray, "3 T"]], ...]:
+    def prediction_intervals(
+        self, draws: int = PREDICTION_DRAWS, seed: int = 0
+    ) -> tuple[dict[str, Float[np.ndarray, "3 T"]], ...]:
         """Return, for each record, the range that contains 94 % of repeated measurements of each channel.
 
         Args:
@@ -188,7 +190,7 @@ class Posterior:
         fewer = self._thinned(draws)
         predicted = fewer._pointwise()[1]
         noise = np.random.default_rng(int(seed)).standard_normal(predicted.shape) * fewer._sigma()
-        ends = np.quantile(predicted + noise, (INTERVAL[0], 0.5, INTERVAL[1]), axis=(0, 1))
+        ends = np.quantile(predicted + noise, (INTERVAL_QUANTILES[0], 0.5, INTERVAL_QUANTILES[1]), axis=(0, 1))
         records = zip(*(self.problem.fit_problem.by_record(rows) for rows in ends), strict=True)
         return tuple({name: np.stack([table[name] for table in tables]) for name in tables[0]} for tables in records)
 

@@ -9,13 +9,13 @@ import numpy as np
 
 from udkjax.argument_types import COUNT, NOT_NEGATIVE_COUNT
 from udkjax.devices import computing_on_host
-from udkjax.extras import BAYES, require
+from udkjax.extras import BAYES_PACKAGES, require
 from udkjax.integrate.solution import versions
 from udkjax.progress import ProgressOption, report_progress
 from udkjax.requirements import concrete_only
 from udkjax.scene.arguments import checked
 from udkjax.study.belief.chains import (
-    DRAWS,
+    DRAWS_PER_CHUNK,
     FIRST_STEP,
     ChainState,
     DrawChunk,
@@ -38,9 +38,9 @@ from udkjax.study.sweep.plan import Chunk as StoredChunk
 from udkjax.study.sweep.store import open_store
 from udkjax.study.sweep.sweep import PATH
 
-STARTS = 256  # number of nearly independent draws whose covariance first scales the chains
-WARMUP = 300  # default number of draws that tune the chains
-STATE = "logdensity", "logdensity_grad"  # parts of the state of chains that are stored besides the last draw
+SCALING_DRAWS = 256  # number of nearly independent draws whose covariance first scales the chains
+WARMUP_DRAWS = 300  # default number of draws that tune the chains
+STATE_PARTS = "logdensity", "logdensity_grad"  # parts of the state of chains that are stored besides the last draw
 
 
 @checked
@@ -50,7 +50,7 @@ def sample(
     *,
     chains: Annotated[int, COUNT] = 8,
     draws: Annotated[int, COUNT] = 1000,
-    warmup: Annotated[int, COUNT] = WARMUP,
+    warmup: Annotated[int, COUNT] = WARMUP_DRAWS,
     seed: Annotated[int, NOT_NEGATIVE_COUNT] = 0,
     out: Annotated[str | os.PathLike[str], PATH] | None = None,
     progress: ProgressOption = None,
@@ -78,11 +78,11 @@ def sample(
             rounding, or no chain moves.
         StoreError: `out` cannot be written to, or contains another posterior.
     """
-    require(*BAYES)
+    require(*BAYES_PACKAGES)
     problem = density.posterior if isinstance(density, Estimate) else density
-    first = -(-warmup // DRAWS)
-    total = first + -(-draws // DRAWS)
-    settings = {"chains": chains, "warmup": first * DRAWS, "seed": seed}
+    first = -(-warmup // DRAWS_PER_CHUNK)
+    total = first + -(-draws // DRAWS_PER_CHUNK)
+    settings = {"chains": chains, "warmup": first * DRAWS_PER_CHUNK, "seed": seed}
     done: list[DrawChunk] = []
     with open_store(out, {**settings, **_fingerprint(problem)} if out is not None else {}, "posterior") as store:
         stored = {int(index[0]): data for index, data in store.read_chunks()}
@@ -98,21 +98,21 @@ def sample(
         begin = tuning = Tuning(FIRST_STEP, covariance_of(start["covariance"], np.unique(w, axis=0)))
         state, compute = first_state(w[:chains]), compile_draws(problem)
         try:
-            with report_progress(progress, total * DRAWS, "sample") as report, computing_on_host():
+            with report_progress(progress, total * DRAWS_PER_CHUNK, "sample") as report, computing_on_host():
                 for k in range(1, total + 1):
                     if k not in stored:
                         randomness = Randomness.of_chunk(seed, k, tuning.step, state.position.shape)
                         root = np.linalg.cholesky(tuning.covariance)
                         state, found = jax.tree.map(np.asarray, compute(coordinates, root, randomness, state))
-                        stored_state = {name: getattr(state, name) for name in STATE}
+                        stored_state = {name: getattr(state, name) for name in STATE_PARTS}
                         done.append(finished(k, {**found, "steps": randomness.steps, **stored_state}))
                     else:
                         done.append(stored[k])
-                    state = ChainState(done[-1]["position"][-1], *(done[-1][name] for name in STATE))
+                    state = ChainState(done[-1]["position"][-1], *(done[-1][name] for name in STATE_PARTS))
                     if k <= first:
                         _require_movement(done, k == first)
                         tuning = (settled if k == first else tuned)(begin, done)
-                    report(k * DRAWS, "warm-up" if k <= first else "")
+                    report(k * DRAWS_PER_CHUNK, "warm-up" if k <= first else "")
         except KeyboardInterrupt:
             if len(done) <= first:
                 raise
@@ -126,7 +126,7 @@ def _start(density: InferenceProblem | Estimate, problem: InferenceProblem, chai
     """
     estimated = isinstance(density, Estimate)
     approximation = density.laplace(seed, quick=False) if estimated else approximate(problem, problem.start, seed)
-    starts = approximation.starts(max(chains, STARTS), seed)
+    starts = approximation.starts(max(chains, SCALING_DRAWS), seed)
     return {"x": starts, "mode": approximation.mode, "covariance": approximation.covariance}
 
 
@@ -134,7 +134,9 @@ def _require_movement(warmup: list[DrawChunk], ended: bool) -> None:
     """Raise an error if no chain has reached a positive density, or if no chain has moved by the end of the warm-up."""
     if not np.isfinite(warmup[-1]["logdensity"]).any():
         cure = "give priors or bounds that keep the numbers where the mechanism runs, or a larger max_steps"
-        raise IdentificationError([f"the density is zero wherever the {DRAWS} first proposals of the chains went: {cure}"])
+        raise IdentificationError(
+            [f"the density is zero wherever the {DRAWS_PER_CHUNK} first proposals of the chains went: {cure}"]
+        )
     if ended and not any(chunk["acceptance"].any() for chunk in warmup):
         cure = "use a longer warmup, or start nearer to the mode, as with the result of `identify`"
         raise IdentificationError([f"no chain accepted any proposal of its warm-up: {cure}"])

@@ -16,7 +16,7 @@ from udkjax.equations.rows.position_rows import PositionRows
 from udkjax.pinv.row_spaces import null_space
 from udkjax.study.diagnosis.configuration import Configuration
 
-DEPENDS = 1e-6  # norm above which a row of N, whose columns are orthonormal, is nonzero; well above rounding errors
+DEPENDENCE_TOL = 1e-6  # norm above which a row of N, whose columns are orthonormal, is nonzero; well above rounding errors
 
 
 class Dependency(NamedTuple):
@@ -36,12 +36,12 @@ def dependencies(N: np.ndarray, owners: Sequence[str], attached: dict[str, tuple
     spanned = np.zeros((N.shape[1], 0))  # basis of the combinations of the collected sets
     remaining = N
     while spanned.shape[1] < N.shape[1]:
-        involved = list(dict.fromkeys(owner[np.linalg.norm(remaining, axis=1) > DEPENDS].tolist()))
+        involved = list(dict.fromkeys(owner[np.linalg.norm(remaining, axis=1) > DEPENDENCE_TOL].tolist()))
         candidates = [_minimal_set_around(seed, involved, remaining, owner, attached) for seed in involved]
         for members in sorted(candidates, key=len):
-            combinations = null_space(N[~np.isin(owner, members)], DEPENDS).T
+            combinations = null_space(N[~np.isin(owner, members)], DEPENDENCE_TOL).T
             svd = np.linalg.svd(np.concatenate([spanned, combinations], axis=1), full_matrices=False)
-            rank = int(np.sum(svd[1] > DEPENDS))
+            rank = int(np.sum(svd[1] > DEPENDENCE_TOL))
             if rank > spanned.shape[1]:
                 collected.append(Dependency(tuple(members), rank - spanned.shape[1]))
                 spanned = svd[0][:, :rank]
@@ -77,7 +77,7 @@ def dependencies_at(
 
 def stress_of(N: np.ndarray, owners: Sequence[str], members: Iterable[str]) -> np.ndarray:
     """Return the combinations of a set's rows that vanish, (m, redundancy): the states of self-stress of the set."""
-    return N @ null_space(N[~np.isin(np.array(owners), list(members))], DEPENDS).T
+    return N @ null_space(N[~np.isin(np.array(owners), list(members))], DEPENDENCE_TOL).T
 
 
 def _minimal_set_around(
@@ -88,9 +88,9 @@ def _minimal_set_around(
     Constraints of `involved` are removed from the set if possible, the farthest first.
     """
     far, members = _distances(seed, involved, attached), list(involved)
-    left = N @ null_space(N[~np.isin(owner, involved)], DEPENDS).T  # combinations that vanish outside of the members
+    left = N @ null_space(N[~np.isin(owner, involved)], DEPENDENCE_TOL).T  # combinations that vanish outside of the members
     for name in sorted(involved, key=lambda name: -far[name]):
-        without = null_space(left[owner == name], DEPENDS)
+        without = null_space(left[owner == name], DEPENDENCE_TOL)
         if len(without):
             members.remove(name)
             left = left @ without.T

@@ -20,11 +20,11 @@ from udkjax.scene.elements.bodies import GROUND
 from udkjax.scene.elements.joints import Constraint
 from udkjax.scene.mechanism import Mechanism
 from udkjax.study.diagnosis.configuration import Configuration, RankedPositions, singular_values
-from udkjax.study.diagnosis.dependence import DEPENDS, Dependency, stress_of
+from udkjax.study.diagnosis.dependence import DEPENDENCE_TOL, Dependency, stress_of
 from udkjax.study.diagnosis.fixes import Fix, JointChange, apply_change, body_indices, changes_of
 
 SMALLEST_PIVOT = 1e-3  # least ratio of the smallest nonzero singular values after and before a fix
-DIGITS = 6  # by which measures of fixes are compared: further ones are rounding errors, which differ between processors
+COMPARED_DIGITS = 6  # by which measures of fixes are compared: further ones are rounding errors, which differ between processors
 
 
 class FixSearch:
@@ -141,7 +141,7 @@ class FixSearch:
             if np.max(np.abs(psi) / unit, initial=0.0) >= self._positions.rank_tol * max(1.0, float(scales.size(c.q, np))):
                 return None  # it does not close here
             J = np.concatenate([c.J[kept], J * self._positions.unit / unit[:, None]])
-            combined = c.left @ null_space(change.removed_rows(len(indices), c.q, places) @ c.left[indices], DEPENDS).T
+            combined = c.left @ null_space(change.removed_rows(len(indices), c.q, places) @ c.left[indices], DEPENDENCE_TOL).T
             left = np.concatenate([combined[kept], change.remaining_rows(combined[indices], c.q, places)])
             found = _Changed(c.t, c.q, J, self._positions.rank_tol, left)
             if found.rank != c.rank or found.redundancy != c.redundancy - removes:
@@ -193,9 +193,9 @@ def _preserves_rank(removed: np.ndarray, N: np.ndarray) -> bool:
     N has the constraint's rows (rows, k) of the basis of the left null space: the rank stays if `removed` N has independent rows.
     """
     part = removed @ N
-    return part.shape[0] <= part.shape[1] and bool(np.all(np.linalg.svd(part, compute_uv=False) > DEPENDS))
+    return part.shape[0] <= part.shape[1] and bool(np.all(np.linalg.svd(part, compute_uv=False) > DEPENDENCE_TOL))
 
 
 def _comparable(measure: float) -> float:
     """Return a measure of a fix without the digits that rounding errors change, so that equal fixes keep their order."""
-    return float(f"{measure:.{DIGITS}g}")
+    return float(f"{measure:.{COMPARED_DIGITS}g}")

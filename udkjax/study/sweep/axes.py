@@ -29,7 +29,7 @@ from udkjax.study.members import structure_of
 from udkjax.study.quantities import Setter, StudyModel
 
 # Settings of a run that are choices, with the label of None for each.
-CHOICES = {
+NONE_LABELS = {
     "mechanism": "",
     "state": "assembled",
     "method": "Auto",
@@ -162,7 +162,7 @@ def labels_of(setting: str, choices: Sequence[AxisChoice], replaced: Collection[
 
 def _short_label(setting: str, choice: AxisChoice) -> str:
     if choice is None:
-        return CHOICES[setting]
+        return NONE_LABELS[setting]
     if isinstance(choice, Model):
         return choice.name
     return str(choice) if isinstance(choice, int) else type(choice).__name__

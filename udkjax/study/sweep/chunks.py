@@ -17,7 +17,7 @@ from udkjax.study.sweep.executors import Done, Executor, run
 from udkjax.study.sweep.groups import group_run
 from udkjax.study.sweep.plan import Chunk, SweepPlan
 
-MEMORY = 2**30  # default limit of the memory of members in computation (bytes)
+DEFAULT_MEMORY = 2**30  # default limit of the memory of members in computation (bytes)
 CHUNK_COPIES = 4  # number of copies of a chunk's stored variables in memory during its computation
 CHUNK_SECONDS = 2.0  # approximate work in a chunk (s); limits the loss by interruptions, and the time between reports
 CHUNKS_FOR_EACH = 4  # number of chunks per device or core, to keep all of them busy to the end
@@ -31,7 +31,7 @@ def compute_members(
     plan: SweepPlan,
     engine: Executor,
     done: Int[np.ndarray, "n"] | Sequence[int] = (),
-    memory: int = MEMORY,
+    memory: int = DEFAULT_MEMORY,
     expect: Callable[[Sequence[Chunk]], None] = lambda chunks: None,
 ) -> Iterator[Done]:
     """Compute the members that are not done, and yield each finished chunk with its data and duration.
@@ -75,7 +75,7 @@ def first_chunks(plan: SweepPlan, orders: Mapping[int, np.ndarray]) -> list[Chun
 
 
 def cut_chunks(
-    plan: SweepPlan, orders: Mapping[int, np.ndarray], measured: Sequence[tuple[Chunk, float]], memory: int = MEMORY
+    plan: SweepPlan, orders: Mapping[int, np.ndarray], measured: Sequence[tuple[Chunk, float]], memory: int = DEFAULT_MEMORY
 ) -> list[Chunk]:
     """Cut the members of each group, in order, into chunks of a few seconds of work and at most `memory` bytes.
 
@@ -144,7 +144,7 @@ class SweepCost:
     computing: float  # time of computing (s)
 
 
-def estimate_cost(plan: SweepPlan, memory: int = MEMORY) -> SweepCost:
+def estimate_cost(plan: SweepPlan, memory: int = DEFAULT_MEMORY) -> SweepCost:
     """Estimate the cost of a plan by compiling and running a piece of some of its groups."""
     orders, compiling, measured = members_to_compute(plan), [], []
     count = len(plan.groups)

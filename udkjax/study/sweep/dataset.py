@@ -12,7 +12,7 @@ from jaxtyping import Int, PyTree
 from udkjax.integrate.solution import CAUSES, Result, scene_text, versions
 from udkjax.scene.elements.bodies import COORDINATES
 from udkjax.study.sweep.axes import AxisColumn, Dimension
-from udkjax.study.sweep.dimensions import NUMBERS_OF, RENAMED, SweepError
+from udkjax.study.sweep.dimensions import NUMBERS_OF, RENAMED_DIMENSIONS, SweepError
 from udkjax.study.sweep.groups import END, RESULT, STEPS, group_run
 from udkjax.study.sweep.measures import Label, guess_label
 from udkjax.study.sweep.plan import Group, StoredVariable, SweepPlan
@@ -109,7 +109,7 @@ def assemble(plan: SweepPlan, finished: Iterable[tuple[Int[np.ndarray, "n"], Map
         for name, v in variables.items()
     }
     data = xarray.Dataset(found, coords=_coordinates(plan))
-    for setting, dimension in RENAMED.items():
+    for setting, dimension in RENAMED_DIMENSIONS.items():
         if data.sizes.keys() >= {dimension} and setting in data.coords:
             data = data.set_xindex(setting)  # allows data.sel({"method": "SVD"})
     data[RESULT].attrs |= {
@@ -179,7 +179,7 @@ def _coordinate(dimension: Dimension, column: AxisColumn) -> dict[str, Labelled]
         attributes["of"] = ", ".join(column.of)
     values = column.coordinate
     if values.ndim == 1:
-        names = {dimension.name, column.name} if dimension.name == RENAMED.get(column.name) else {column.name}
+        names = {dimension.name, column.name} if dimension.name == RENAMED_DIMENSIONS.get(column.name) else {column.name}
         return dict.fromkeys(names, (dimension.name, values, attributes))
     dims = (dimension.name, *(f"{column.name}_{k}" for k in range(1, values.ndim)))
     return {dimension.name: np.arange(dimension.size), f"{column.name}_value": (dims, values, attributes)}

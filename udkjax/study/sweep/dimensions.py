@@ -22,7 +22,7 @@ from udkjax.scene.numbers.units import NUMBERS
 from udkjax.scene.tables.checks import Mistakes, SceneError
 from udkjax.study.quantities import StudyModel
 from udkjax.study.sweep.axes import (
-    CHOICES,
+    NONE_LABELS,
     Axis,
     AxisChoice,
     AxisColumn,
@@ -37,16 +37,16 @@ from udkjax.study.sweep.axes import (
 from udkjax.wording import abbreviate, quote, suggestion
 
 Settings: TypeAlias = Mapping[str, Any]  # further arguments of `simulate`
-MEMBER = "member"  # the dimension of a design
+MEMBER_DIMENSION = "member"  # the dimension of a design
 NUMBERS_OF = {"stabilization": ("alpha", "beta"), "method": ("rank_tol", "branch_tol")}  # numbers of settings that may be axes
 _SETTING_OF_NUMBER = {name: setting for setting, names in NUMBERS_OF.items() for name in names}
 # Settings that are checked together: constant steps need `dt0`, and solvers that do not estimate errors need constant steps.
-TOGETHER = ("solver", "stepsize_controller", "dt0")
+STEP_SETTINGS = ("solver", "stepsize_controller", "dt0")
 # Dimensions and variables of the dataset, whose names a dimension of the sweep cannot have.
-TAKEN = ("time", "body", "coordinate", "result", "steps", "end_time")
+RESERVED_NAMES = ("time", "body", "coordinate", "result", "steps", "end_time")
 # Arguments of `sel`, `isel` and `interp` of xarray: `data.sel(method="SVD")` would not select anything, without an error.
 XARRAY_ARGUMENTS = ("method", "tolerance", "drop", "indexers", "missing_dims", "coords", "assume_sorted", "kwargs", "self")
-RENAMED = {"method": "pseudoinverse"}  # dimensions of settings whose names xarray has taken
+RENAMED_DIMENSIONS = {"method": "pseudoinverse"}  # dimensions of settings whose names xarray has taken
 
 
 class SweepError(Mistakes):
@@ -92,7 +92,7 @@ def lay_out(mechanism: StudyModel, axes: Mapping[str, AxisValues], design: Sweep
     dimensions: list[Dimension] = []
     if unit and design is not None:
         columns = [_column(mechanism, name, axes[name], unit[name], problems) for name in ranges]
-        dimensions.append(Dimension(MEMBER, design.n, tuple(column for column in columns if column is not None)))
+        dimensions.append(Dimension(MEMBER_DIMENSION, design.n, tuple(column for column in columns if column is not None)))
     for name, given in axes.items():
         if name in unit:
             continue
@@ -105,11 +105,11 @@ def lay_out(mechanism: StudyModel, axes: Mapping[str, AxisValues], design: Sweep
         sizes = {column.name: len(column.values) for column in columns}
         if len(set(sizes.values())) > 1:
             problems.append(f"{name}: zipped axes must have equally many values, but have {sizes}")
-        if name in TAKEN or (name == MEMBER and unit):
+        if name in RESERVED_NAMES or (name == MEMBER_DIMENSION and unit):
             problems.append(
                 f"axis {quote(name)}: the dataset has a dimension or variable of this name; choose another, with of=..."
             )
-        dimension = RENAMED.get(name, name) if [column.of for column in columns] == [(name,)] else name
+        dimension = RENAMED_DIMENSIONS.get(name, name) if [column.of for column in columns] == [(name,)] else name
         if dimension in XARRAY_ARGUMENTS:
             problems.append(
                 f"axis {quote(name)}: data.sel({name}=...) of xarray has another meaning; choose another name, with of=..."
@@ -158,7 +158,7 @@ def _column(
         problems.append(f"axis {quote(name)}: needs at least one value, not {abbreviate(values)}")
     if len(problems) > before or values is None:
         return None
-    if not callable(of) and any(target in CHOICES for target in of):
+    if not callable(of) and any(target in NONE_LABELS for target in of):
         return _choices(name, of, values, problems)
     numbers = _numbers(values)
     may_be_nan = not callable(of) and all(target in _SETTING_OF_NUMBER for target in of)  # for members that do not use it
@@ -201,8 +201,8 @@ def _numbers(values: Values) -> np.ndarray | None:
 def _unknown_targets(mechanism: StudyModel, name: str, of: Sequence[str]) -> Iterator[str]:
     parameters = mechanism.number_fields()
     for target in of:
-        if target not in NUMBERS and target not in CHOICES and split_index(target, parameters)[0] not in parameters:
-            near = suggestion(target, (*parameters, *NUMBERS, *CHOICES)) or _suggest_ending(target, parameters)
+        if target not in NUMBERS and target not in NONE_LABELS and split_index(target, parameters)[0] not in parameters:
+            near = suggestion(target, (*parameters, *NUMBERS, *NONE_LABELS)) or _suggest_ending(target, parameters)
             yield f"axis {quote(name)}: {quote(target)} is neither a parameter of the mechanism nor a setting{near}"
 
 
@@ -256,7 +256,7 @@ def check_settings(mechanism: StudyModel, dimensions: Sequence[Dimension], setti
         problems += [text if column is None else f"axis {quote(column.name)}: {text}" for text, column in columns_of]
 
     for target, column in targets.items():
-        if target in TOGETHER and column.is_choice:
+        if target in STEP_SETTINGS and column.is_choice:
             continue
         for value in column.values if column.is_choice else np.unique(column.numbers) if target in NUMBERS else ():
             wrong = argument_problems(simulate, {"mechanism": mechanism, target: value})
@@ -279,10 +279,10 @@ def check_settings(mechanism: StudyModel, dimensions: Sequence[Dimension], setti
 
 def _combinations(dimensions: Sequence[Dimension], settings: Settings) -> Iterator[dict[str, Any]]:
     """Iterate over the combinations of those settings that are checked together."""
-    fixed = {name: settings[name] for name in TOGETHER if name in settings}
+    fixed = {name: settings[name] for name in STEP_SETTINGS if name in settings}
 
     def choices(dimension: Dimension) -> list[dict[str, Any]]:
-        columns = [(name, c) for c in dimension.columns if not callable(c.of) for name in c.of if name in TOGETHER]
+        columns = [(name, c) for c in dimension.columns if not callable(c.of) for name in c.of if name in STEP_SETTINGS]
         count = dimension.size if any(column.is_choice for _, column in columns) else 1  # all numbers fit alike
         return [{name: column.values[k] for name, column in columns} for k in range(count)]
 

@@ -25,7 +25,7 @@ from udkjax.wording import abbreviate
 JsonValue: TypeAlias = "str | int | float | bool | Sequence[JsonValue] | Mapping[str, JsonValue] | None"
 MOST_LINES = 24  # largest number of printed differences; further ones are counted
 MOST_NUMBERS = 64  # largest array written in full; larger arrays by shape, first and last number, and a digest
-STATS = ("steps", "accepted", "rejected", "implicit", "right_hand_sides", "projections")
+COUNTS_OF_STEPS = ("steps", "accepted", "rejected", "implicit", "right_hand_sides", "projections")
 
 
 def fingerprint(plan: SweepPlan) -> dict[str, JsonValue]:
@@ -80,7 +80,7 @@ def _solution(plan: SweepPlan) -> Solution:
         return jax.tree.map(lambda x: np.zeros(x.shape, x.dtype) if isinstance(x, jax.ShapeDtypeStruct) else x, shapes)
     number, states = np.zeros(()), np.zeros((len(plan.ts), *plan.state_shape_of(plan.groups[0])))
     count, model = np.zeros((), int), plan.mechanism
-    stats = dict.fromkeys(STATS, count)
+    stats = dict.fromkeys(COUNTS_OF_STEPS, count)
     return Solution(plan.ts, states, states, count, number, stats, number, number, model.body_names, ())  # pyright: ignore[reportArgumentType]
 
 

@@ -19,7 +19,7 @@ from udkjax.study.sweep.axes import Axis, Distribution, LatinHypercube, Random, 
 from udkjax.wording import abbreviate, quote, suggestion, unknown_key
 
 Toml: TypeAlias = "str | int | float | bool | list[Toml] | dict[str, Toml]"
-TOP = ("t0", "t1", "dt", "ts", "measures", "derivatives", "reference", "axes", "settings", "design")
+TOP_KEYS = ("t0", "t1", "dt", "ts", "measures", "derivatives", "reference", "axes", "settings", "design")
 SETTINGS = ("rtol", "atol", *CHOICES, "max_steps", "drift_tol", "dt0")
 DESIGNS = {"sobol": Sobol, "latin-hypercube": LatinHypercube, "random": Random}
 SCALES = {"linear": np.linspace, "log": np.geomspace}
@@ -66,7 +66,7 @@ class _GridReader:
         self.problems: list[str] = []
 
     def sweep(self, given: TomlTable) -> dict[str, Any]:
-        self.check_keys("", given, TOP)
+        self.check_keys("", given, TOP_KEYS)
         axes = self.table("axes", given.get("axes", {}))
         if given.get("axes", {}) == {}:
             self.wrong("axes", 'missing; write [axes], and below it such as "body.link1.mass" = [1.0, 2.0]')

@@ -90,7 +90,7 @@ class Measure:
         return replace(self, labels={key if alone else f"{key}_{name}": label for name, label in self.labels.items()})
 
 
-NAMELESS = "lambda"  # name of an anonymous function
+LAMBDA_NAME = "lambda"  # name of an anonymous function
 
 
 def guess_label(name: str, shape: tuple[int, ...], outputs: int, state_shape: tuple[int, ...], units: str = "") -> Label:
@@ -160,7 +160,7 @@ def _call(function: UserMeasure, name: str, run: MeasuredRun) -> dict[str, Array
     with refuse_untraceable(f"measure {quote(name)}"):
         outputs = function(run.mechanism, run.solution)
     if isinstance(outputs, Mapping):
-        front = "" if name == NAMELESS else f"{name}_"
+        front = "" if name == LAMBDA_NAME else f"{name}_"
         return {f"{front}{key}": jnp.asarray(value) for key, value in outputs.items()}
     return {name: jnp.asarray(outputs)}
 
@@ -188,7 +188,7 @@ def _largest(x: Array) -> Array:
 # --- measures by name
 
 MEASURES: dict[str, Measure] = {}
-_STATE, _OVER_TIME = ("body", "coordinate"), ("time", "body", "coordinate")
+_STATE_DIMENSIONS, _TIME_DIMENSIONS = ("body", "coordinate"), ("time", "body", "coordinate")
 
 
 def _named(name: str, along: bool = True, **labels: Label) -> Callable[[Compute], Compute]:
@@ -207,8 +207,8 @@ def _named(name: str, along: bool = True, **labels: Label) -> Callable[[Compute]
 @_named(
     "final",
     along=False,
-    q_end=Label(_STATE, "m, m, rad", "coordinates at the end"),
-    v_end=Label(_STATE, "m/s, m/s, rad/s", "velocities at the end"),
+    q_end=Label(_STATE_DIMENSIONS, "m, m, rad", "coordinates at the end"),
+    v_end=Label(_STATE_DIMENSIONS, "m/s, m/s, rad/s", "velocities at the end"),
 )
 def _final(run: MeasuredRun) -> dict[str, Array]:
     return {"q_end": run.solution.q[-1], "v_end": run.solution.v[-1]}
@@ -216,8 +216,8 @@ def _final(run: MeasuredRun) -> dict[str, Array]:
 
 @_named(
     "states",
-    q=Label(_OVER_TIME, "m, m, rad", "coordinates: centre of mass and angle"),
-    v=Label(_OVER_TIME, "m/s, m/s, rad/s", "velocities"),
+    q=Label(_TIME_DIMENSIONS, "m, m, rad", "coordinates: centre of mass and angle"),
+    v=Label(_TIME_DIMENSIONS, "m/s, m/s, rad/s", "velocities"),
 )
 def _states(run: MeasuredRun) -> dict[str, Array]:
     return {"q": run.solution.q, "v": run.solution.v}

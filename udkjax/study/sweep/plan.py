@@ -22,10 +22,10 @@ from udkjax.scene.model import Model
 from udkjax.study.members import structure_of
 from udkjax.study.quantities import StudyModel
 from udkjax.study.sweep.axes import AxisChoice, AxisColumn, AxisValues, Dimension, SweepDesign
-from udkjax.study.sweep.dimensions import TOGETHER, Settings, SweepError, check_settings, check_tangents, lay_out
+from udkjax.study.sweep.dimensions import STEP_SETTINGS, Settings, SweepError, check_settings, check_tangents, lay_out
 from udkjax.study.sweep.measures import Measure, MeasureChoice, Reference, measures_of
 
-OUTSIDE = ("throw", "progress", "adjoint")  # arguments of `simulate` that only a sweep sets
+SWEEP_ARGUMENTS = ("throw", "progress", "adjoint")  # arguments of `simulate` that only a sweep sets
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,11 +181,11 @@ def make_plan(
     Raises:
         SweepError: lists every mistake.
     """
-    problems = [f"{name}: a sweep has no such setting" for name in settings if name in OUTSIDE]
+    problems = [f"{name}: a sweep has no such setting" for name in settings if name in SWEEP_ARGUMENTS]
     wrong = argument_problems(make_plan, {"mechanism": mechanism})
     if wrong:
         raise SweepError(wrong)
-    alone = {name: value for name, value in settings.items() if name not in TOGETHER}
+    alone = {name: value for name, value in settings.items() if name not in STEP_SETTINGS}
     problems += argument_problems(simulate, {"mechanism": mechanism, **alone})
     try:
         require_output_times("ts", ts)
@@ -201,7 +201,7 @@ def make_plan(
     targets = {target for d in dimensions for c in d.columns if not callable(c.of) for target in c.of}
     if targets & {"alpha", "beta"} and "stabilization" not in targets:
         settings.setdefault("stabilization", Baumgarte())  # an axis of gains needs a stabilization
-    if dimensions or not axes.keys() & {*TOGETHER}:  # with mistakes in axes their values are unknown
+    if dimensions or not axes.keys() & {*STEP_SETTINGS}:  # with mistakes in axes their values are unknown
         problems += check_settings(mechanism, dimensions, settings)
     if mechanism.q0 is None and not {"state"} & {*targets, *settings}:
         problems.append("state: a ConstrainedSystem without q0 has no initial guess: give state=State(q, v)")

@@ -21,7 +21,7 @@ from udkjax.requirements import concrete_only
 from udkjax.scene.arguments import checked
 from udkjax.study.quantities import StudyModel
 from udkjax.study.sweep.axes import AxisValues, SweepDesign
-from udkjax.study.sweep.chunks import MEMORY, compute_members
+from udkjax.study.sweep.chunks import DEFAULT_MEMORY, compute_members
 from udkjax.study.sweep.dataset import assemble, variables_of
 from udkjax.study.sweep.executors import Executor, compute_on_devices, dask_engine
 from udkjax.study.sweep.fingerprint import fingerprint
@@ -65,7 +65,7 @@ def sweep(
     engine: Engine = "auto",
     client: Annotated["distributed.Client", CLIENT] | None = None,
     out: Annotated[str | os.PathLike[str], PATH] | None = None,
-    memory: Annotated[int, COUNT] = MEMORY,
+    memory: Annotated[int, COUNT] = DEFAULT_MEMORY,
     progress: ProgressOption = None,
     **settings: Any,
 ) -> "xarray.Dataset":
@@ -137,7 +137,7 @@ def _engine(engine: str, client: "distributed.Client | None") -> Executor:
 
 
 T = TypeVar("T", int, float)
-STEPS = "steps"  # variable by which members are compared
+STEPS_VARIABLE = "steps"  # variable by which members are compared
 
 
 @dataclass(frozen=True)
@@ -193,7 +193,7 @@ class Watch:
         self.new += len(chunk.members)
         self.work_done += chunk.work if self.work else 0.0
         failures = _count_failures(before.failures, data["result"])
-        slowest = _find_slowest(before.slowest, chunk.members, data.get(STEPS))
+        slowest = _find_slowest(before.slowest, chunk.members, data.get(STEPS_VARIABLE))
         slowest_chunk = _find_slowest(before.slowest_chunk, [chunk.index], seconds)
         self.state = replace(
             before,

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from udkjax.synthesis.ranges.second_order import Quadratic
 
-SMOOTHING = 0.05  # width of the edges of limits, in standard deviations of the measure
+SMOOTHING_WIDTH = 0.05  # width of the edges of limits, in standard deviations of the measure
 MOST_SCALE = 100.0  # largest factor of a tolerance: beyond, it does not matter, and the quadratic function does not hold
 HALVINGS = 20  # of the interval of the common factor
 
@@ -46,7 +46,7 @@ def optimal_scales(
     from scipy.optimize import minimize
 
     slope, curvature = model.slope[limits.which], model.curvature[limits.which]
-    width = SMOOTHING * np.sqrt((slope**2).sum(1) + (curvature**2).sum((1, 2)) / 2.0) + 1e-300
+    width = SMOOTHING_WIDTH * np.sqrt((slope**2).sum(1) + (curvature**2).sum((1, 2)) / 2.0) + 1e-300
 
     def smoothed(logs: np.ndarray) -> tuple[float, np.ndarray]:
         t = np.exp(logs)

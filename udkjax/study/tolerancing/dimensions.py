@@ -25,8 +25,8 @@ from udkjax.wording import quote, suggestion
 
 # Least change of a number by the deviation of another, relative to its own deviation, that contradicts its tolerance: a share far
 # above rounding errors, and below that to which tolerances are known.
-HIDES = 1e-3
-SHAPE = "pin", "length", "number"  # kinds of numbers of a drawing that may set each other
+LEAST_EFFECT = 1e-3
+SHAPE_KINDS = "pin", "length", "number"  # kinds of numbers of a drawing that may set each other
 
 
 class DeviationSource(NamedTuple):
@@ -86,7 +86,9 @@ class ToleratedNumbers:
         table = np.array(rows)
         self.nominal, self.middle, self.sizes = table[:, 0], table[:, 1], table[:, 2]
         self.owners = table[:, 3].astype(int)
-        self._require_independence([name for name in given if not isinstance(given[name], PinClearance) and _kind(name) in SHAPE])
+        self._require_independence(
+            [name for name in given if not isinstance(given[name], PinClearance) and _kind(name) in SHAPE_KINDS]
+        )
 
     def _require_independence(self, given: Sequence[str]):
         """Refuse numbers if one of them sets another, such as a pin and a length that ends there: one would hide the other."""
@@ -100,7 +102,9 @@ class ToleratedNumbers:
             k = own[name]
             moved = apply_values(self.mechanism, [self.targets[k]], jnp.asarray([self.nominal[k] + self.sizes[k]]))
             changes = np.abs(np.asarray(unknowns_of(moved, read).guess) - nominal)
-            set_by = [other for other, is_moved in zip(names, changes > HIDES * sizes, strict=True) if is_moved and other != name]
+            set_by = [
+                other for other, is_moved in zip(names, changes > LEAST_EFFECT * sizes, strict=True) if is_moved and other != name
+            ]
             problems += [f"tolerances: {name} changes {other}, which has a tolerance, too: give one of them" for other in set_by]
         if problems:
             raise SceneError(problems, self.mechanism.name)

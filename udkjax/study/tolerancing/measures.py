@@ -43,7 +43,7 @@ REDUCTIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "last": lambda x: x[:, -1],
 }
 DEVIATION = "deviation"  # the largest distance from the position of the nominal mechanism
-VALUES = 72  # values over a turn, if none are given: every 5 degrees
+VALUES_PER_TURN = 72  # values over a turn, if none are given: every 5 degrees
 IN_CACHE = 1024  # samples at a time: their positions stay in the processor's cache
 IN_PROGRAM = 256  # samples at a time of a function of the mechanism
 
@@ -131,7 +131,7 @@ class Measuring:
         if values is None:
             if not self._driven.is_angle:
                 raise SceneError(["values: give the values of the driver, which is not an angle"], mechanism.name)
-            return float(self._driven.value(mechanism.q0)) + FULL_TURN / VALUES * np.arange(VALUES)
+            return float(self._driven.value(mechanism.q0)) + FULL_TURN / VALUES_PER_TURN * np.arange(VALUES_PER_TURN)
         found = np.asarray(values, float)
         if found.ndim != 1 or not len(found) or not np.isfinite(found).all():
             raise ValueError("values must be a list of finite numbers, those of the driver")

@@ -25,8 +25,8 @@ from udkjax.synthesis.ranges.second_order import Quadratic, quadratic
 from udkjax.wording import quote, suggestion
 
 QUANTILES = (0.001, 0.01, 0.05, 0.5, 0.95, 0.99, 0.999)
-TRUSTED = 0.05  # largest difference between mean or standard deviation and those of samples, in standard deviations
-CONSTANT = 1e-12  # standard deviation of a measure, relative to its largest value, up to which it is rounding
+TRUSTED_DIFFERENCE = 0.05  # largest difference between mean or standard deviation and those of samples, in standard deviations
+CONSTANT_TOL = 1e-12  # standard deviation of a measure, relative to its largest value, up to which it is rounding
 AT_ONCE = 2**16  # samples between reports of progress
 FOR_SEARCH = 20_000  # samples with which the cheapest tolerances are found
 
@@ -128,14 +128,14 @@ class ToleranceAnalysis:
         model, (own, pairs) = self._quadratic, self._parts
         mean, deviation = model.mean, np.sqrt(own.sum(1) + pairs.sum((1, 2)) / 2.0)
         of_samples, spread = self._reached.mean(0), self._reached.std(0)
-        close = np.maximum(np.abs(mean - of_samples), np.abs(deviation - spread)) <= TRUSTED * spread
+        close = np.maximum(np.abs(mean - of_samples), np.abs(deviation - spread)) <= TRUSTED_DIFFERENCE * spread
         trusted = {name: bool(x) for name, x in zip(self.names, close | self._is_constant, strict=True)}
         return SecondOrder(self._by_name(mean), self._by_name(deviation), trusted)
 
     @property
     def _is_constant(self) -> Bool[np.ndarray, "measures"]:
         """Mask of the measures that vary by rounding errors alone."""
-        return self._reached.std(0) <= CONSTANT * np.abs(self._reached).max(0, initial=0.0)
+        return self._reached.std(0) <= CONSTANT_TOL * np.abs(self._reached).max(0, initial=0.0)
 
     @cached_property
     def shares(self) -> dict[str, dict[str, Share]]:

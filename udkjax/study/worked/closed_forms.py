@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from udkjax.study.worked.loops import LoopVector, VectorLoop, wrapped
-from udkjax.study.worked.symbols import AXES, NAMES, PositionSymbols, component, defined
+from udkjax.study.worked.symbols import AXES, COMPONENT_FUNCTIONS, PositionSymbols, component, defined
 from udkjax.study.worked.terms import (
     AppliedFunction,
     EquationLine,
@@ -109,7 +109,7 @@ def _two_angles(
         one = _less_turn("θ", first, phi, lines)
         parts = []
         for axis, known in enumerate((kx, ky)):
-            sum_ = total((1.0, known), (first.sign, ProductOfTerms((a, of_angle(NAMES[axis], phi)))))
+            sum_ = total((1.0, known), (first.sign, ProductOfTerms((a, of_angle(COMPONENT_FUNCTIONS[axis], phi)))))
             parts.append(total((-second.sign, sum_)))
         psi, line = _angle_symbol(second, AppliedFunction("atan2", (parts[1], parts[0])))
         lines.append(line)
@@ -153,7 +153,7 @@ def _angle_and_length(
         s, line = defined("s", index, total((-sliding.sign, p), (sign, root)), "m")
         lines, parts = [line], []
         for axis, known in enumerate((kx, ky)):
-            sum_ = total((1.0, known), (sliding.sign, ProductOfTerms((s, of_angle(NAMES[axis], psi)))))
+            sum_ = total((1.0, known), (sliding.sign, ProductOfTerms((s, of_angle(COMPONENT_FUNCTIONS[axis], psi)))))
             parts.append(total((-other.sign, sum_)))
         phi, line = _angle_symbol(other, AppliedFunction("atan2", (parts[1], parts[0])))
         lines.append(line)

@@ -24,8 +24,8 @@ from udkjax.study.worked.solution import WorkedSolution, worked_solution
 from udkjax.wording import quote, suggestion
 
 MOST_TRIALS = 500  # for one student: dimensions that assemble and turn may be rare
-FINEST = 4  # steps of a range for each student: all students can have different numbers
-AT = "at"  # the name of the driver's value among the varied numbers
+STEPS_PER_STUDENT = 4  # steps of a range for each student: all students can have different numbers
+AT_NAME = "at"  # the name of the driver's value among the varied numbers
 _RANGE = re.compile(r"\s*(.+?)\s+([-+]?[\d.]+(?:[eE][-+]?\d+)?)\s*\.\.\s*([-+]?[\d.]+(?:[eE][-+]?\d+)?)\s*(\S.*?)?\s*")
 
 
@@ -85,8 +85,8 @@ def read_variation(mechanism: Mechanism, text: str) -> Variation:
     low, high = float(match[2]), float(match[3])
     if not low < high:
         raise SceneError([f"vary: {quote(text)}: the range must increase"])
-    if title == AT:
-        return Variation(title, AT, low, high, unit or Count.of(mechanism, only_driver(mechanism)).unit, 1.0)
+    if title == AT_NAME:
+        return Variation(title, AT_NAME, low, high, unit or Count.of(mechanism, only_driver(mechanism)).unit, 1.0)
     length = re.fullmatch(r"length\((.+)\)", title)
     name = title if length is None else _length_parameter(drawing, length[1])
     known = mechanism.parameters()
@@ -167,7 +167,7 @@ def _drawn(rng: np.random.Generator, one: Variation, count: int) -> float:
 
     `count` is the number of students, for whom there are enough such numbers.
     """
-    finest = (one.high - one.low) / (FINEST * max(count, 5))
+    finest = (one.high - one.low) / (STEPS_PER_STUDENT * max(count, 5))
     power = 10.0 ** np.floor(np.log10(finest))
     step = max(k * power for k in (1.0, 2.0, 5.0) if k * power <= finest * (1 + 1e-9))
     first, last = int(np.ceil(one.low / step - 1e-9)), int(np.floor(one.high / step + 1e-9))
@@ -177,8 +177,8 @@ def _drawn(rng: np.random.Generator, one: Variation, count: int) -> float:
 def _tried(
     mechanism: Mechanism, vary: Sequence[Variation], numbers: dict[str, float], at: str, turns: bool, digits: int
 ) -> WorkedSolution:
-    values = {one.name: numbers[one.title] * one.size for one in vary if one.name != AT}
-    place = next((f"{numbers[one.title]!r} {one.unit}" for one in vary if one.name == AT), at)
+    values = {one.name: numbers[one.title] * one.size for one in vary if one.name != AT_NAME}
+    place = next((f"{numbers[one.title]!r} {one.unit}" for one in vary if one.name == AT_NAME), at)
     changed = mechanism.with_parameters(values)
     if turns:
         limits = travel(changed, only_driver(changed))

@@ -11,15 +11,15 @@ from udkjax.study.worked.loops import Geometry
 from udkjax.study.worked.terms import NumberStyle
 from udkjax.text_places import TextPlaces
 
-WIDTH, MARGIN = 560.0, 46.0  # of a figure, in its units
-TALLEST = 460.0
-HEAD = 9.0  # length of an arrow's head
-NICE = (1.0, 2.0, 5.0)  # times a power of ten: the scales of polygons
+FIGURE_WIDTH, MARGIN = 560.0, 46.0  # of a figure, in its units
+MOST_HEIGHT = 460.0
+HEAD_LENGTH = 9.0  # length of an arrow's head
+NICE_FACTORS = (1.0, 2.0, 5.0)  # times a power of ten: the scales of polygons
 PER_CM = 37.8  # units of a figure in a centimetre
-LETTERS, BASE = 13.0, 4.5  # height of letters, and the baseline below their middle
-CLEAR, PIN = 4.0, 6.0  # from a line to its text, and around a pin
-FARTHER = 0.0, 14.0, 28.0  # farther from the line, where there is no room next to it
-SHARES = 0.5, 0.35, 0.65, 0.2, 0.8  # places of a text along a line
+LETTER_HEIGHT, BASELINE = 13.0, 4.5  # height of letters, and the baseline below their middle
+TEXT_CLEARANCE, PIN_CLEARANCE = 4.0, 6.0  # from a line to its text, and around a pin
+EXTRA_DISTANCES = 0.0, 14.0, 28.0  # farther from the line, where there is no room next to it
+TEXT_SHARES = 0.5, 0.35, 0.65, 0.2, 0.8  # places of a text along a line
 
 
 class PolygonSide(NamedTuple):
@@ -46,7 +46,7 @@ class _Frame:
     def __init__(self, points: Sequence[np.ndarray], scale: float | None = None):
         low, high = np.min(points, axis=0), np.max(points, axis=0)
         size = np.maximum(high - low, 1e-300)
-        self.scale = scale or float(min((WIDTH - 2 * MARGIN) / size[0], (TALLEST - 2 * MARGIN) / size[1]))
+        self.scale = scale or float(min((FIGURE_WIDTH - 2 * MARGIN) / size[0], (MOST_HEIGHT - 2 * MARGIN) / size[1]))
         self.width, self.height = np.maximum(self.scale * (high - low) + 2 * MARGIN, 160.0)
         self.low, self.middle = low, 0.5 * (low + high)
 
@@ -55,7 +55,7 @@ class _Frame:
         return float(0.5 * self.width + x), float(0.5 * self.height - y)
 
     def texts(self) -> TextPlaces:
-        return TextPlaces(float(self.width), float(self.height), LETTERS)
+        return TextPlaces(float(self.width), float(self.height), LETTER_HEIGHT)
 
     def svg(self, parts: Sequence[str], title: str) -> str:
         box = f"0 0 {self.width:.1f} {self.height:.1f}"
@@ -73,7 +73,7 @@ def drawing_figure(geometry: Geometry, style: NumberStyle, names: bool = True) -
         parts.append(_line(frame, ends[0], ends[1], "guide"))
     texts = frame.texts()
     of_pins = {pin: np.array(frame.at(place)) for pin, place in places.items()}
-    texts.boxes += [(place, *(PIN * np.eye(2))) for place in of_pins.values()]
+    texts.boxes += [(place, *(PIN_CLEARANCE * np.eye(2))) for place in of_pins.values()]
     texts.boxes += [(of_pins[pin] + [0.0, 8.0], *(8.0 * np.eye(2))) for pin in drawing.ground if pin in of_pins]
     pairs = dict.fromkeys(pair for link in drawing.links.values() for pair in link.sides if places.keys() >= set(pair))
     sides = [(a, b) for a, b in pairs if np.any(places[b] - places[a])]
@@ -119,11 +119,11 @@ def polygon_figure(sides: Sequence[PolygonSide], style: NumberStyle, unit: str, 
     shown = style.size(unit)
     per_cm = PER_CM / fits / shown  # of the shown unit
     power = 10.0 ** np.floor(np.log10(per_cm))
-    nice = next((k * power for k in NICE if k * power >= per_cm * (1 - 1e-9)), 10 * power)
+    nice = next((k * power for k in NICE_FACTORS if k * power >= per_cm * (1 - 1e-9)), 10 * power)
     frame = _Frame(points, PER_CM / (nice * shown))
     texts, pole = frame.texts(), np.array(frame.at(np.zeros(2)))
     texts.lines += [(np.array(frame.at(side.start)), np.array(frame.at(side.end))) for side in sides]
-    texts.boxes.append((pole, *(PIN * np.eye(2))))
+    texts.boxes.append((pole, *(PIN_CLEARANCE * np.eye(2))))
     parts = [_arrow(frame, side, texts) for side in sides]
     parts.append(f'<circle cx="{pole[0]:.1f}" cy="{pole[1]:.1f}" r="3" class="pin"/>{_text(texts.put_around(pole, "o"), "o")}')
     caption = f"{title}; 1 cm is {nice:g} {style.unit(unit)}"
@@ -140,13 +140,13 @@ def _beside(texts: TextPlaces, start: np.ndarray, end: np.ndarray, words: str) -
     """Return the place of the middle of a text beside a line, where there is room."""
     way = end - start
     across = np.array([way[1], -way[0]]) / np.hypot(*way)
-    off = CLEAR + 0.5 * (texts.width(words) * abs(across[0]) + LETTERS * abs(across[1]))
-    offs = [side * (off + far) for far in FARTHER for side in (1, -1)]
-    return texts.put([start + share * way + x * across for x in offs for share in SHARES], words)
+    off = TEXT_CLEARANCE + 0.5 * (texts.width(words) * abs(across[0]) + LETTER_HEIGHT * abs(across[1]))
+    offs = [side * (off + far) for far in EXTRA_DISTANCES for side in (1, -1)]
+    return texts.put([start + share * way + x * across for x in offs for share in TEXT_SHARES], words)
 
 
 def _text(middle: np.ndarray, words: str) -> str:
-    return f'<text x="{middle[0]:.1f}" y="{middle[1] + BASE:.1f}" text-anchor="middle">{words}</text>'
+    return f'<text x="{middle[0]:.1f}" y="{middle[1] + BASELINE:.1f}" text-anchor="middle">{words}</text>'
 
 
 def _arrow(frame: _Frame, side: PolygonSide, texts: TextPlaces) -> str:
@@ -156,7 +156,7 @@ def _arrow(frame: _Frame, side: PolygonSide, texts: TextPlaces) -> str:
     if length < 1.0:
         return ""
     unit = way / length
-    across, base = np.array([-unit[1], unit[0]]), np.array([x2, y2]) - min(HEAD, 0.5 * length) * unit
+    across, base = np.array([-unit[1], unit[0]]), np.array([x2, y2]) - min(HEAD_LENGTH, 0.5 * length) * unit
     corners = [np.array([x2, y2]), base + 3.2 * across, base - 3.2 * across]
     head = " ".join(f"{x:.1f},{y:.1f}" for x, y in corners)
     letter, _, index = side.name.partition("_")

@@ -8,11 +8,11 @@ import numpy as np
 from udkjax.scene.elements.bodies import GROUND
 from udkjax.study.worked.loops import LoopVector, VectorLoop
 
-GRAIN = np.pi / 18  # rad: angles of the estimate are multiples of it, and lengths of this fraction of the longest vector
+ESTIMATE_GRAIN = np.pi / 18  # rad: angles of the estimate are multiples of it, and lengths of this fraction of the longest vector
 HALVINGS = 8  # of this grain, until the estimate leads to the position
 MOST_STEPS = 20
-CLOSED = 1e-14  # relative to the longest vector: residuals of closed loops
-SAME = 1e-9  # rad, or relative to the longest vector: differences of the same position
+CLOSED_TOL = 1e-14  # relative to the longest vector: residuals of closed loops
+SAME_POSITION_TOL = 1e-9  # rad, or relative to the longest vector: differences of the same position
 
 
 class PositionRates(NamedTuple):
@@ -40,15 +40,15 @@ def newton_steps(loops: Sequence[VectorLoop], rates: PositionRates) -> list[Newt
     longest = max(abs(x.size) for loop in loops for x in loop.vectors)
     units = np.array([1.0 if kind == "angle" else longest for kind, _ in names])
     for halvings in range(HALVINGS):
-        grain = GRAIN * units / 2**halvings
+        grain = ESTIMATE_GRAIN * units / 2**halvings
         x, steps = np.round(goal / grain) * grain, []
         for _ in range(MOST_STEPS):
             f, J = _closures(loops, rates, dict(zip(names, x, strict=True)))
             steps.append(NewtonStep(x.tolist(), float(np.max(np.abs(f)))))
-            if np.max(np.abs(f)) <= CLOSED * longest or np.linalg.matrix_rank(J) < len(x):
+            if np.max(np.abs(f)) <= CLOSED_TOL * longest or np.linalg.matrix_rank(J) < len(x):
                 break
             x = x - np.linalg.solve(J, f)
-        if np.all(np.abs(x - goal) <= SAME * units):
+        if np.all(np.abs(x - goal) <= SAME_POSITION_TOL * units):
             return steps
     return []
 

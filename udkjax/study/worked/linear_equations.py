@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 from udkjax.scene.elements.bodies import GROUND
 from udkjax.study.worked.loops import LoopVector, VectorLoop
-from udkjax.study.worked.symbols import NAMES, PositionSymbols, defined
+from udkjax.study.worked.symbols import COMPONENT_FUNCTIONS, PositionSymbols, defined
 from udkjax.study.worked.terms import (
     EquationLine,
     EquationTerm,
@@ -90,13 +90,13 @@ def _of_angle(symbols: PositionSymbols, loop: VectorLoop, body: str, axis: int) 
     parts = []
     for x in loop.vectors:
         if x.body == body:
-            turned = ProductOfTerms((symbols.length(x), of_angle(NAMES[1 - axis], symbols.direction(x))))
+            turned = ProductOfTerms((symbols.length(x), of_angle(COMPONENT_FUNCTIONS[1 - axis], symbols.direction(x))))
             parts.append((-x.sign if axis == 0 else x.sign, turned))
     return total(*parts)
 
 
 def _of_slide(symbols: PositionSymbols, loop: VectorLoop, slide: str, axis: int) -> SumOfTerms:
-    return total(*((x.sign, of_angle(NAMES[axis], symbols.direction(x))) for x in loop.vectors if x.slide == slide))
+    return total(*((x.sign, of_angle(COMPONENT_FUNCTIONS[axis], symbols.direction(x))) for x in loop.vectors if x.slide == slide))
 
 
 def _velocity(
@@ -104,12 +104,12 @@ def _velocity(
 ) -> list[tuple[float, EquationTerm]]:
     """Return the known parts of a vector's rate along an axis: r omega across the vector, and its change of length along it."""
     sign, way = vector.sign, symbols.direction(vector)
-    across = (-sign if axis == 0 else sign, of_angle(NAMES[1 - axis], way))
+    across = (-sign if axis == 0 else sign, of_angle(COMPONENT_FUNCTIONS[1 - axis], way))
     found = []
     if vector.body != GROUND and not _has(loops, vector.body, "angles"):
         found.append((across[0], ProductOfTerms((symbols.length(vector), symbols.angle(vector.body, 1), across[1]))))
     if vector.slide and not _has(loops, vector.slide, "slides"):
-        found.append((sign, ProductOfTerms((symbols.length(vector, 1), of_angle(NAMES[axis], way)))))
+        found.append((sign, ProductOfTerms((symbols.length(vector, 1), of_angle(COMPONENT_FUNCTIONS[axis], way)))))
     return found
 
 
@@ -122,7 +122,7 @@ def _acceleration(
     part.
     """
     sign, way, size = vector.sign, symbols.direction(vector), symbols.length(vector)
-    along, across = of_angle(NAMES[axis], way), of_angle(NAMES[1 - axis], way)
+    along, across = of_angle(COMPONENT_FUNCTIONS[axis], way), of_angle(COMPONENT_FUNCTIONS[1 - axis], way)
     turned = -sign if axis == 0 else sign
     found: list[tuple[float, EquationTerm]] = []
     if vector.body != GROUND:

@@ -16,7 +16,7 @@ from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.tables.checks import SceneError
 from udkjax.wording import quote
 
-NOTHING = 1e-9  # relative to the extent of the pins: vectors and offsets that are shorter are left out
+NEGLIGIBLE = 1e-9  # relative to the extent of the pins: vectors and offsets that are shorter are left out
 MOST_SEARCHED = 16  # bodies of which groups are looked for; there are 2^16
 
 
@@ -119,7 +119,7 @@ class Geometry:
             raise SceneError([f"the line of {joint.name} is on {guide}, which has no pin to count from"], self.mechanism.name)
         arms = {pin: place - self.places[pin] for pin in pins}
         offsets = {pin: float(along[0] * arm[1] - along[1] * arm[0]) for pin, arm in arms.items()}
-        least, fixed = NOTHING * self.extent, self.drawing.ground
+        least, fixed = NEGLIGIBLE * self.extent, self.drawing.ground
         start = min(pins, key=lambda pin: (round(abs(offsets[pin]) / least), pin not in fixed))
         sign = -1.0 if along @ arms[start] < 0 else 1.0
         return start, float(np.arctan2(sign * along[1], sign * along[0])), sign * offsets[start]
@@ -139,11 +139,13 @@ class Geometry:
         """
         arm = self.places[end] - self.places[start]
         size = float(np.hypot(*arm))
-        if size <= NOTHING * self.extent:
+        if size <= NEGLIGIBLE * self.extent:
             return []
         root = self.root(body)
         turn = wrapped(float(np.arctan2(arm[1], arm[0])) - self.angles[root])
-        is_against = abs(abs(turn) - np.pi) < NOTHING if root != GROUND else turn > 0.5 * np.pi + NOTHING or turn < -0.5 * np.pi
+        is_against = (
+            abs(abs(turn) - np.pi) < NEGLIGIBLE if root != GROUND else turn > 0.5 * np.pi + NEGLIGIBLE or turn < -0.5 * np.pi
+        )
         if is_against:
             return [LoopVector(end, start, -1.0, root, _tidy(wrapped(turn + np.pi)), size)]
         return [LoopVector(start, end, 1.0, root, _tidy(turn), size)]
@@ -156,7 +158,7 @@ class Geometry:
         arm = self.places[joint.pin] - self.places[start]
         size = float(arm @ [np.cos(way), np.sin(way)])
         foot, found = start, []
-        if abs(offset) > NOTHING * self.extent:
+        if abs(offset) > NEGLIGIBLE * self.extent:
             foot = f"{joint.pin}′"
             side = wrapped(turn + np.copysign(0.5 * np.pi, offset))
             found.append(LoopVector(start, foot, sign, root, _tidy(side), abs(offset)))
@@ -180,7 +182,7 @@ def wrapped(angle: float) -> float:
 
 def _tidy(angle: float) -> float:
     """Return an angle; zero if only rounding separates it from zero."""
-    return 0.0 if abs(angle) < NOTHING else angle
+    return 0.0 if abs(angle) < NEGLIGIBLE else angle
 
 
 def _connections(mechanism: Mechanism, drawing: Drawing) -> Iterator[Connection]:

@@ -13,7 +13,7 @@ from udkjax.study.worked.terms import (
 )
 
 AXES = ("x", "y")
-NAMES = ("cos", "sin")
+COMPONENT_FUNCTIONS = ("cos", "sin")
 
 
 class PositionSymbols:
@@ -50,7 +50,7 @@ class PositionSymbols:
 
 def component(symbols: PositionSymbols, vector: LoopVector, axis: int) -> EquationTerm:
     """Return the component of a vector along x (`axis` 0) or y (1)."""
-    return ProductOfTerms((symbols.length(vector), of_angle(NAMES[axis], symbols.direction(vector))))
+    return ProductOfTerms((symbols.length(vector), of_angle(COMPONENT_FUNCTIONS[axis], symbols.direction(vector))))
 
 
 def defined(letter: str, index: str, right: EquationTerm, unit: str) -> tuple[NamedQuantity, EquationLine]:

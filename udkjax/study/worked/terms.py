@@ -10,9 +10,9 @@ import numpy as np
 
 from udkjax.scene.drawing.drawn_quantities import Units
 
-PLAIN = ("", "1")
+PLAIN_UNITS = ("", "1")
 LONGEST_LINE = 48  # characters with numbers; longer lines are divided
-_MARKS = {1: "\u02d9", 2: "\u00a8"}  # dots of the first and the second derivative
+_DERIVATIVE_DOTS = {1: "\u02d9", 2: "\u00a8"}  # dots of the first and the second derivative
 _FUNCTIONS = {"cos": np.cos, "sin": np.sin, "sqrt": np.sqrt, "acos": np.arccos, "atan2": np.arctan2}
 _ANGLES_OF = ("acos", "atan2")
 _SHOWN_ANGLES = {"acos": "arccos", "atan2": "atan2"}
@@ -98,7 +98,7 @@ class NamedQuantity(EquationTerm):
             return _number(style.number(self.known, self.unit), "°" if self.unit == "rad" else "")
         letter = f"<mi>{escape(self.letter)}</mi>"
         if self.order:
-            letter = f'<mover accent="true">{letter}<mo>{_MARKS[self.order]}</mo></mover>'
+            letter = f'<mover accent="true">{letter}<mo>{_DERIVATIVE_DOTS[self.order]}</mo></mover>'
         return f"<msub>{letter}<mtext>{escape(self.index)}</mtext></msub>" if self.index else letter
 
 
@@ -304,7 +304,7 @@ class EquationLine(NamedTuple):
         right = self.right.text(style, numbers)
         if self.left is None:
             return f"{right} = 0"
-        unit = "" if self.left.unit in PLAIN else f" {style.unit(self.left.unit)}"
+        unit = "" if self.left.unit in PLAIN_UNITS else f" {style.unit(self.left.unit)}"
         result = f" = {style.number(self.left.value, self.left.unit)}{unit}" if numbers else ""
         if self.right is self.left:  # a value alone
             return f"{self.left.name}{result}"
@@ -327,7 +327,7 @@ class EquationLine(NamedTuple):
         steps = [self.right.mathml(style, False), self.right.mathml(style, True)]
         unit = style.unit(self.left.unit)
         shown = _number(style.number(self.left.value, self.left.unit), unit if unit == "°" else "")
-        shown += f'<mspace width="0.25em"></mspace><mtext>{escape(unit)}</mtext>' if unit not in (*PLAIN, "°") else ""
+        shown += f'<mspace width="0.25em"></mspace><mtext>{escape(unit)}</mtext>' if unit not in (*PLAIN_UNITS, "°") else ""
         steps = steps[:1] if steps[0] == steps[1] else steps
         if steps[-1] == shown:
             steps = steps[:-1]

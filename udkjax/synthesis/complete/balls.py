@@ -1,7 +1,7 @@
 """Ball arithmetic: arrays of real numbers with radii that enclose all rounding errors.
 
 A ball has a midpoint and a radius. Midpoints have the longest floating-point type of the processor, or are exact fractions; each
-operation adds a bound of its rounding error to the radius. Radii, in float64, are rounded up by INFLATE, which exceeds the
+operation adds a bound of its rounding error to the radius. Radii, in float64, are rounded up by INFLATION, which exceeds the
 rounding errors of all operations of a certificate.
 """
 
@@ -10,10 +10,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-LONG = np.longdouble
-ROUNDING = float(np.finfo(LONG).eps)  # twice the largest relative error of one operation on midpoints
-INFLATE = 1.0 + 1e-10  # factor of a radius in each operation; covers about 1e6 roundings of float64
-SMALLEST = float(np.finfo(float).tiny)  # bound of the error by underflow
+LONG_DOUBLE = np.longdouble
+ROUNDING = float(np.finfo(LONG_DOUBLE).eps)  # twice the largest relative error of one operation on midpoints
+INFLATION = 1.0 + 1e-10  # factor of a radius in each operation; covers about 1e6 roundings of float64
+UNDERFLOW_BOUND = float(np.finfo(float).tiny)  # bound of the error by underflow
 
 
 class Ball(NamedTuple):
@@ -27,13 +27,13 @@ class Ball(NamedTuple):
     @classmethod
     def of(cls, x: Any, rad: Any = 0.0) -> "Ball":
         """Return balls with midpoints x and radii `rad`."""
-        mid = np.asarray(x, LONG)
+        mid = np.asarray(x, LONG_DOUBLE)
         return cls(mid, np.broadcast_to(np.asarray(rad, float), mid.shape))
 
     @classmethod
     def fractions(cls, x: Any) -> "Ball":
         """Return numbers as exact balls, whose midpoints are fractions."""
-        x = np.asarray(x, LONG)
+        x = np.asarray(x, LONG_DOUBLE)
         high = x.astype(float)
         low = (x - high).astype(float)
         exact = [Fraction(a) + Fraction(b) for a, b in zip(high.ravel().tolist(), low.ravel().tolist(), strict=True)]
@@ -67,11 +67,11 @@ class Ball(NamedTuple):
     def __truediv__(self, other: Any) -> "Ball":
         """Return the quotient; its radius is infinite where the divisor may be zero."""
         b = self._like(other)
-        least = _size(b.mid) / INFLATE - b.rad
+        least = _size(b.mid) / INFLATION - b.rad
         with np.errstate(divide="ignore", invalid="ignore"):
             mid = self.mid / b.mid
             rad = _up((self.rad + _size(mid) * b.rad) / least + ROUNDING * _size(mid))
-        return Ball(np.where(least > 0, mid, LONG(0)), np.where(least > 0, rad, np.inf))
+        return Ball(np.where(least > 0, mid, LONG_DOUBLE(0)), np.where(least > 0, rad, np.inf))
 
     def _like(self, x: Any) -> "Ball":
         """Return x as balls; numbers become balls whose midpoints have the type of those of `self`."""
@@ -91,7 +91,7 @@ class Ball(NamedTuple):
     @property
     def least(self) -> np.ndarray:
         """The smallest modulus of the numbers in each ball, in float64; zero or less if the ball contains zero."""
-        return (_size(self.mid) / INFLATE - self.rad) / INFLATE
+        return (_size(self.mid) / INFLATION - self.rad) / INFLATION
 
     def overlaps(self, other: "Ball") -> np.ndarray:
         """Return a mask of the entries whose balls may overlap."""
@@ -128,7 +128,7 @@ class ComplexBall(NamedTuple):
 
     def distance(self, z: np.ndarray) -> np.ndarray:
         """Return the largest distance between the numbers of each ball and complex numbers."""
-        return np.hypot((self.re - np.real(z)).largest, (self.im - np.imag(z)).largest) * INFLATE
+        return np.hypot((self.re - np.real(z)).largest, (self.im - np.imag(z)).largest) * INFLATION
 
 
 def _rounding(x: np.ndarray) -> np.ndarray | float:
@@ -136,8 +136,8 @@ def _rounding(x: np.ndarray) -> np.ndarray | float:
 
 
 def _size(x: np.ndarray) -> np.ndarray:
-    return np.asarray(np.abs(x), float) * INFLATE
+    return np.asarray(np.abs(x), float) * INFLATION
 
 
 def _up(x: np.ndarray) -> np.ndarray:
-    return x * INFLATE + SMALLEST
+    return x * INFLATION + UNDERFLOW_BOUND

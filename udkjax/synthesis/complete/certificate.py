@@ -15,13 +15,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from udkjax.synthesis.complete.balls import INFLATE, LONG, ROUNDING, SMALLEST, Ball
+from udkjax.synthesis.complete.balls import INFLATION, LONG_DOUBLE, ROUNDING, UNDERFLOW_BOUND, Ball
 
-WIDTHS = (2.0, 16.0)  # half-widths of the boxes tried in turn, relative to the Newton step
+BOX_WIDTHS = (2.0, 16.0)  # half-widths of the boxes tried in turn, relative to the Newton step
 LEAST_SHARE = 1e-3  # smallest width of a box in a component, relative to its largest width
 NEWTON_STEPS, EXACT_STEPS = 10, 4  # largest numbers of steps; each step doubles the number of correct digits
-FARTHEST = 1e8  # Newton's method has diverged beyond this size of the unknowns
-SURE = 1e-3  # largest relative Newton step, including rounding, for which exact arithmetic is tried
+DIVERGED_SIZE = 1e8  # Newton's method has diverged beyond this size of the unknowns
+EXACT_TRIAL_STEP = 1e-3  # largest relative Newton step, including rounding, for which exact arithmetic is tried
 EPS = float(np.finfo(float).eps)
 
 BallFunction = Callable[[Ball], tuple[Ball, Ball]]
@@ -61,11 +61,11 @@ def certify(system: BallFunction, u: np.ndarray, exact: BallFunction | None = No
     Returns:
         Boxes around the solutions; those at which F' is singular to within rounding remain unproven.
     """
-    m, inverse = _improved(system, np.asarray(u, LONG))
+    m, inverse = _improved(system, np.asarray(u, LONG_DOUBLE))
     F, _ = system(Ball.of(m))
     result = _prove(system, m, inverse, F)
     step = np.max(_product(inverse, F) / np.maximum(np.abs(m).astype(float), 1.0), axis=0)
-    uncertain = np.flatnonzero(~result.is_proven & (step < SURE) & (np.max(np.abs(m), axis=0) < FARTHEST))
+    uncertain = np.flatnonzero(~result.is_proven & (step < EXACT_TRIAL_STEP) & (np.max(np.abs(m), axis=0) < DIVERGED_SIZE))
     if exact is None or not len(uncertain):
         return result
     m, inverse = m[:, uncertain], inverse[uncertain]
@@ -80,7 +80,7 @@ def certify(system: BallFunction, u: np.ndarray, exact: BallFunction | None = No
 def _evaluate(exact: BallFunction, m: np.ndarray) -> Ball:
     """Return the values F of the equations at points m, computed in fractions and rounded."""
     F = exact(Ball.fractions(m))[0].mid.astype(float)
-    return Ball.of(F, EPS * np.abs(F) + SMALLEST)
+    return Ball.of(F, EPS * np.abs(F) + UNDERFLOW_BOUND)
 
 
 def _prove(system: BallFunction, m: np.ndarray, inverse: np.ndarray, F: Ball) -> Certificate:
@@ -91,11 +91,11 @@ def _prove(system: BallFunction, m: np.ndarray, inverse: np.ndarray, F: Ball) ->
     proven, radius = np.zeros(m.shape[1], bool), np.full(m.shape, np.inf)
     step = _product(inverse, F)
     size = np.maximum(np.abs(m).astype(float), 1.0)
-    for width in WIDTHS:
+    for width in BOX_WIDTHS:
         r = width * np.maximum(step, LEAST_SHARE * size * np.max(step / size, axis=0))
         _, slopes = system(Ball.of(m, r))
         with np.errstate(invalid="ignore", over="ignore"):
-            reach = (step + _contraction(inverse, slopes, r)) * INFLATE
+            reach = (step + _contraction(inverse, slopes, r)) * INFLATION
             now = np.all(reach < r, axis=0) & ~proven
         radius[:, now], proven = r[:, now], proven | now
     return Certificate(m, radius, proven)
@@ -130,10 +130,10 @@ def _inverses(A: np.ndarray) -> np.ndarray:
 def _product(Y: np.ndarray, F: Ball) -> np.ndarray:
     """Return bounds (N, M) of |Y F|."""
     n = len(F.mid)
-    mid = np.abs(np.einsum("mij,jm->im", Y.astype(LONG), F.mid)).astype(float)
+    mid = np.abs(np.einsum("mij,jm->im", Y.astype(LONG_DOUBLE), F.mid)).astype(float)
     with np.errstate(invalid="ignore"):
         rounded = np.einsum("mij,jm->im", np.abs(Y), F.rad + (n + 2) * ROUNDING * np.abs(F.mid).astype(float))
-        return (mid + rounded) * INFLATE
+        return (mid + rounded) * INFLATION
 
 
 def _contraction(Y: np.ndarray, slopes: Ball, r: np.ndarray) -> np.ndarray:
@@ -142,5 +142,5 @@ def _contraction(Y: np.ndarray, slopes: Ball, r: np.ndarray) -> np.ndarray:
     A = np.moveaxis(slopes.mid, -1, 0).astype(float)
     rad = np.moveaxis(slopes.rad, -1, 0) + EPS * np.abs(A)  # for the rounding to float64 above
     difference = np.abs(np.eye(n) - Y @ A) * (1.0 + EPS)
-    difference = difference + np.abs(Y) @ (rad + (n + 2) * EPS * np.abs(A)) * INFLATE + EPS
-    return (difference @ r.T[..., None])[..., 0].T * INFLATE
+    difference = difference + np.abs(Y) @ (rad + (n + 2) * EPS * np.abs(A)) * INFLATION + EPS
+    return (difference @ r.T[..., None])[..., 0].T * INFLATION

@@ -16,10 +16,10 @@ from udkjax.scene.tables.checks import SceneError
 from udkjax.synthesis.complete.balls import ComplexBall
 from udkjax.synthesis.complete.complete_designs import CompleteDesigns, OtherSolution
 from udkjax.synthesis.complete.drawn_four_bar import DrawnFourBar, read_four_bar
-from udkjax.synthesis.complete.five_poses import DYADS, find_real_dyads
+from udkjax.synthesis.complete.five_poses import DYAD_COUNT, find_real_dyads
 from udkjax.synthesis.complete.four_bars import (
     DEFECTS,
-    KINDS,
+    GRASHOF_KINDS,
     FourBarBoxes,
     FourBars,
     classify,
@@ -120,7 +120,7 @@ def design_all(
     return CompleteDesigns(
         {name: place[best] for name, place in places.items()},
         drawn.values(bars, classification.values)[best],
-        tuple(KINDS[k] for k in classification.kind[best]),
+        tuple(GRASHOF_KINDS[k] for k in classification.kind[best]),
         classification.turns[best],
         tuple(DEFECTS[k] for k in classification.defect[best]),
         classification.circuits[best],
@@ -218,7 +218,7 @@ def _through_poses(targets: np.ndarray) -> _Solutions:
     pivot = joint - crank
     boxes = FourBarBoxes(pivot.part(first), pivot.part(second), joint.part(first), joint.part(second))
     radii = radius_of(boxes, bars, P[0], dyads.scale)
-    counts = {"dyads": DYADS, "infinite": dyads.infinite}
+    counts = {"dyads": DYAD_COUNT, "infinite": dyads.infinite}
     numbers, unproven = np.arange(len(pairs)), dyads.scale * dyads.unproven.T
     others = [("unproven", {"A": _isotropic(*v[:2]), "O": _isotropic(*(v[:2] - v[2:]))}) for v in unproven]
     return _Solutions(bars, radii, numbers, np.zeros(len(pairs), int), u.shape[1], others, counts)

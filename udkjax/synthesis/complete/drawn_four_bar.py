@@ -13,7 +13,7 @@ from udkjax.scene.tables.checks import SceneError
 from udkjax.synthesis.complete.four_bars import FourBars
 from udkjax.wording import quote
 
-OTHERS = ("slide", "slot", "gear", "cam", "body", "joint")
+OTHER_SECTIONS = ("slide", "slot", "gear", "cam", "body", "joint")
 
 
 class DrawnFourBar(NamedTuple):
@@ -62,7 +62,7 @@ def read_four_bar(mechanism: Mechanism, point: str, driver: Drive) -> DrawnFourB
     point = point.removeprefix("pin.")
     pivoting = {name: pins for name, pins in links.items() if set(pins) & set(ground)}
     free = [name for name in links if name not in pivoting]
-    problems = [f"a four-bar has no {section}s: delete them" for section in OTHERS if groups.get(section)]
+    problems = [f"a four-bar has no {section}s: delete them" for section in OTHER_SECTIONS if groups.get(section)]
     if (
         len(links) != 3
         or len(free) != 1

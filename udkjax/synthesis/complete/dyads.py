@@ -23,7 +23,7 @@ import numpy as np
 from udkjax.expressions import Graph, ScalarProgram
 from udkjax.expressions.scalars.complex_scalars import ComplexScalar, solve_complex
 from udkjax.expressions.scalars.selection import absolute
-from udkjax.synthesis.complete.balls import LONG, Ball
+from udkjax.synthesis.complete.balls import LONG_DOUBLE, Ball
 
 ArrayOrBall = Any  # arrays or balls
 
@@ -86,7 +86,7 @@ def four_bar_system(d: Displacements):
         values = [*(dyad.g for dyad in dyads), unit]
         F = Ball(*(np.concatenate([getattr(v, name) for v in values]) for name in Ball._fields))
         shape, M = (3 * J, 8 + 2 * J), u.mid.shape[1]
-        mid, rad = np.zeros((*shape, M), LONG), np.zeros((*shape, M))
+        mid, rad = np.zeros((*shape, M), LONG_DOUBLE), np.zeros((*shape, M))
         for k, dyad in enumerate(dyads):
             rows = k * J + places
             columns = [*range(4 * k, 4 * k + 4), 8 + places, 8 + J + places]
@@ -105,10 +105,10 @@ def _full(x: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 
 # --- in isotropic coordinates
 
-JOINTS = 8  # unknowns x, X, r, R, y, Y, s, S
-POINTS = 8  # displacements from the first of nine points
-UNKNOWNS = JOINTS + POINTS
-LEAST = 1e-3  # smallest scale of a joint coordinate, for the choice of pivots
+JOINT_UNKNOWNS = 8  # unknowns x, X, r, R, y, Y, s, S
+DISPLACEMENTS = 8  # displacements from the first of nine points
+UNKNOWNS = JOINT_UNKNOWNS + DISPLACEMENTS
+LEAST_SCALE = 1e-3  # smallest scale of a joint coordinate, for the choice of pivots
 
 
 def newton_and_tangent() -> ScalarProgram:
@@ -125,13 +125,13 @@ def newton_and_tangent() -> ScalarProgram:
         return [ComplexScalar(*pair) for pair in zip(*parts, strict=True)]
 
     unknowns, (s,) = numbers("z", UNKNOWNS), numbers("s", 1)
-    start, rates = numbers("p", 2 * POINTS), numbers("v", 2 * POINTS)
+    start, rates = numbers("p", 2 * DISPLACEMENTS), numbers("v", 2 * DISPLACEMENTS)
     unit = graph.constant(1.0)
     matrix, right, turns = [], [], []
-    sizes = [absolute(z.re) + absolute(z.im) + LEAST for z in unknowns[:JOINTS]]
-    for j, f in enumerate(unknowns[JOINTS:]):
-        d, D = (start[k] + s * rates[k] for k in (j, j + POINTS))
-        moves = rates[j], rates[j + POINTS]
+    sizes = [absolute(z.re) + absolute(z.im) + LEAST_SCALE for z in unknowns[:JOINT_UNKNOWNS]]
+    for j, f in enumerate(unknowns[JOINT_UNKNOWNS:]):
+        d, D = (start[k] + s * rates[k] for k in (j, j + DISPLACEMENTS))
+        moves = rates[j], rates[j + DISPLACEMENTS]
         dyads = [_dyad(unknowns[k : k + 4], f, d, D, moves) for k in (0, 4)]
         (u, row, r), (v, other, q) = dyads
         size = unit / (u.squared_modulus + v.squared_modulus)
@@ -145,7 +145,7 @@ def newton_and_tangent() -> ScalarProgram:
         turns.append((u.conjugate.scaled(size), v.conjugate.scaled(size), dyads))
     solution = [[x.scaled(size) for x in row] for row, size in zip(solve_complex(matrix, right), sizes, strict=True)]
     for u, v, ((_, row, r), (_, other, q)) in turns:
-        remainders = [_minus(r, row, solution[:4]), _minus(q, other, solution[4:JOINTS])]
+        remainders = [_minus(r, row, solution[:4]), _minus(q, other, solution[4:JOINT_UNKNOWNS])]
         solution.append([u * a + v * b for a, b in zip(*remainders, strict=True)])
     outputs = [getattr(row[k], part) for k in (0, 1) for part in ("re", "im") for row in solution]
     return ScalarProgram(graph, inputs, outputs)

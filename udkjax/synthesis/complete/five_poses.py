@@ -14,15 +14,15 @@ import numpy as np
 from udkjax.synthesis.complete.balls import ROUNDING, Ball
 from udkjax.synthesis.complete.certificate import Certificate, certify
 from udkjax.synthesis.complete.dyads import dyad_system
-from udkjax.synthesis.complete.nine_points import SAME, displacements, power_of_two_near
+from udkjax.synthesis.complete.nine_points import SAME_PLACE_TOL, displacements, power_of_two_near
 
-DYADS = 4  # number of dyads through generic poses, including complex dyads
+DYAD_COUNT = 4  # number of dyads through generic poses, including complex dyads
 NEARLY_REAL, SURELY_REAL = 1e-4, 1e-8
 AT_INFINITY = 1e-7  # a joint or pivot at a distance of extent / AT_INFINITY counts as infinite
-ISOTROPIC = 1e-6  # distance from the isotropic points that counts as zero, in homogeneous coordinates of norm one
+ISOTROPIC_TOL = 1e-6  # distance from the isotropic points that counts as zero, in homogeneous coordinates of norm one
 SMALLEST_CUBIC = 1e-11  # smallest singular value of the minors' cubic terms for which zeros are isolated
-MONOMIALS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
-CUBIC = ((3, 0), (2, 1), (1, 2), (0, 3))
+QUADRATIC_MONOMIALS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
+CUBIC_MONOMIALS = ((3, 0), (2, 1), (1, 2), (0, 3))
 SINE_TOL = 8.0 * ROUNDING  # error of a sine in the longest floating-point type
 
 
@@ -52,7 +52,7 @@ def require_five_poses(poses: np.ndarray) -> None:
     for i, j in combinations(range(5), 2):
         off = poses[i] - poses[j]
         turn = abs((off[2] + np.pi) % (2 * np.pi) - np.pi)
-        if np.max(np.abs(off[:2])) <= SAME * extent and turn <= SAME:
+        if np.max(np.abs(off[:2])) <= SAME_PLACE_TOL * extent and turn <= SAME_PLACE_TOL:
             raise ValueError(f"goal: targets {i} and {j} are the same pose: four poses leave infinitely many four-bars")
 
 
@@ -101,7 +101,7 @@ def _zeros(dx: np.ndarray, dy: np.ndarray, p: np.ndarray, s: np.ndarray) -> tupl
     Q = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
     L = L @ Q
     minors = [_determinant(L[list(rows)]) for rows in combinations(range(4), 3)]
-    table = np.array([[minor.get(m, 0.0) for m in (*CUBIC, *MONOMIALS)] for minor in minors])
+    table = np.array([[minor.get(m, 0.0) for m in (*CUBIC_MONOMIALS, *QUADRATIC_MONOMIALS)] for minor in minors])
     table /= np.linalg.norm(table, axis=1, keepdims=True) + (np.linalg.norm(table, axis=1, keepdims=True) == 0)
     if np.linalg.svd(table[:, :4], compute_uv=False)[-1] < SMALLEST_CUBIC:
         raise ValueError("dyads through these poses are not isolated: change a pose that others repeat, mirror or translate")
@@ -109,9 +109,13 @@ def _zeros(dx: np.ndarray, dy: np.ndarray, p: np.ndarray, s: np.ndarray) -> tupl
     steps = []
     for move in ((1, 0), (0, 1)):
         rows = []
-        for m in MONOMIALS:
+        for m in QUADRATIC_MONOMIALS:
             product = (m[0] + move[0], m[1] + move[1])
-            rows.append(np.eye(6)[MONOMIALS.index(product)] if product in MONOMIALS else reduced[CUBIC.index(product)])
+            rows.append(
+                np.eye(6)[QUADRATIC_MONOMIALS.index(product)]
+                if product in QUADRATIC_MONOMIALS
+                else reduced[CUBIC_MONOMIALS.index(product)]
+            )
         steps.append(np.array(rows))
     _, vectors = np.linalg.eig(0.6 * steps[0] + 0.8 * steps[1])
     joints = Q @ np.stack([vectors[1], vectors[2], vectors[0]])

@@ -12,7 +12,7 @@ import numpy as np
 from udkjax.synthesis.complete.balls import Ball, ComplexBall
 from udkjax.synthesis.complete.certificate import Certificate
 
-KINDS = (
+GRASHOF_KINDS = (
     "double crank",
     "crank-rocker",
     "double rocker",
@@ -90,7 +90,7 @@ class Classification(NamedTuple):
     """Kinds of M four-bars, and circuits, branches and order of their J positions.
 
     Attributes:
-        kind: indices of KINDS (M,).
+        kind: indices of GRASHOF_KINDS (M,).
         turns: whether the crank turns fully (M,).
         circuits: the circuit of each position (M, J), numbered from that of the first position, 0.
         branches: the branch of each position (M, J), numbered in the same way.
@@ -113,7 +113,7 @@ def classify(bars: FourBars) -> Classification:
     lengths = bars.lengths
     total, longest, shortest = lengths.sum(axis=0), lengths.max(axis=0), lengths.min(axis=0)
     is_grashof = 2.0 * (shortest + longest) < total
-    kind = np.where(is_grashof, np.argmin(lengths, axis=0), len(KINDS) - 1)
+    kind = np.where(is_grashof, np.argmin(lengths, axis=0), len(GRASHOF_KINDS) - 1)
     turns = is_grashof & (kind <= 1)
     side = np.sign(bars.transmission)
     angle = _relative_angles(bars, lengths)

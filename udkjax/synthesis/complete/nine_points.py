@@ -16,23 +16,30 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import KDTree
 
-from udkjax.synthesis.complete.balls import LONG, Ball
+from udkjax.synthesis.complete.balls import LONG_DOUBLE, Ball
 from udkjax.synthesis.complete.certificate import Certificate, certify
-from udkjax.synthesis.complete.dyads import JOINTS, POINTS, UNKNOWNS, Displacements, four_bar_system, newton_and_tangent
+from udkjax.synthesis.complete.dyads import (
+    DISPLACEMENTS,
+    JOINT_UNKNOWNS,
+    UNKNOWNS,
+    Displacements,
+    four_bar_system,
+    newton_and_tangent,
+)
 from udkjax.synthesis.complete.four_bars import certainly_different
 from udkjax.synthesis.complete.path_tracking import ACCEPTED, INFINITE, LOST, SINGULAR, PathTracker, Precision
 
-CLASSES = 1442
-STARTS = Path(__file__).with_name("nine_points.npz")
-FIRST = Precision(3e-3, 3e-2, 1e-5)
-CLOSE = Precision(3e-4, 3e-3, 1e-6)
+CLASS_COUNT = 1442
+STARTS_FILE = Path(__file__).with_name("nine_points.npz")
+FIRST_PRECISION = Precision(3e-3, 3e-2, 1e-5)
+CLOSE_PRECISION = Precision(3e-4, 3e-3, 1e-6)
 BENDS = (0.0, 0.6, -0.6)  # detours around parameters at which solutions meet, tried in turn while classes are missing
-ALIKE = 1e-7  # relative difference of pivots below which classes are the same; raised if there are too many classes
+SAME_CLASS_TOL = 1e-7  # relative difference of pivots below which classes are the same; raised if there are too many classes
 # Largest imaginary parts, relative to the largest unknown: of candidates for a proof, and of unproven ends that count as real.
 NEARLY_REAL, SURELY_REAL = 1e-4, 1e-8
-REFINED = 1e-8  # largest Newton step at a regular solution, relative to the unknowns, with residuals in long precision
+REFINED_STEP = 1e-8  # largest Newton step at a regular solution, relative to the unknowns, with residuals in long precision
 REFINEMENTS = 8  # largest number of Newton steps; each doubles the number of correct digits
-SAME = 1e-12  # relative to the extent: places or poses that differ by less are the same
+SAME_PLACE_TOL = 1e-12  # relative to the extent: places or poses that differ by less are the same
 # A coupler curve has degree six and passes three times through both isotropic points at infinity. A line or circle that is
 # not part of the curve meets it in six further points at most.
 MOST_ON_A_LINE = 6
@@ -92,7 +99,7 @@ def require_nine_points(points: np.ndarray) -> None:
         raise ValueError(f"goal: finitely many four-bars go through nine points; there are {len(points)}: {cure}")
     extent = float(np.max(np.ptp(points, axis=0)))
     for i, j in combinations(range(9), 2):
-        if np.max(np.abs(points[i] - points[j])) <= SAME * extent:
+        if np.max(np.abs(points[i] - points[j])) <= SAME_PLACE_TOL * extent:
             raise ValueError(
                 f"goal: targets {i} and {j} are the same point: eight points leave infinitely many four-bars; move one"
             )
@@ -114,16 +121,18 @@ def find_real_classes(points: np.ndarray) -> RealClasses:
     """Return the real classes of four-bars through nine points (9, 2); raise `ValueError` if they may not be isolated."""
     require_nine_points(points)
     scale = power_of_two_near(points)
-    places = np.asarray(points, LONG) / scale
+    places = np.asarray(points, LONG_DOUBLE) / scale
     d = places[1:] - places[0]
     z, paths, ends = find_classes((d[:, 0] + 1j * d[:, 1]).astype(complex))
-    x, conjugates = z[0:JOINTS:2], z[1:JOINTS:2].conj()
-    turn = 1.0 + z[JOINTS:]
+    x, conjugates = z[0:JOINT_UNKNOWNS:2], z[1:JOINT_UNKNOWNS:2].conj()
+    turn = 1.0 + z[JOINT_UNKNOWNS:]
     unreal = np.max(np.abs(turn - 1.0 / turn.conj()) / np.abs(turn), axis=0)  # turns may be complex even if joints are real
-    reality = np.maximum(np.max(np.abs(x - conjugates), axis=0) / (1.0 + np.max(np.abs(z[:JOINTS]), axis=0)), unreal)
+    reality = np.maximum(np.max(np.abs(x - conjugates), axis=0) / (1.0 + np.max(np.abs(z[:JOINT_UNKNOWNS]), axis=0)), unreal)
     near = reality < NEARLY_REAL
     joints, turns = 0.5 * (x + conjugates)[:, near], turn[:, near] / np.abs(turn[:, near]) - 1.0
-    u = np.concatenate([np.stack([np.real(joints), np.imag(joints)], 1).reshape(JOINTS, -1), np.real(turns), np.imag(turns)])
+    u = np.concatenate(
+        [np.stack([np.real(joints), np.imag(joints)], 1).reshape(JOINT_UNKNOWNS, -1), np.real(turns), np.imag(turns)]
+    )
     exact = Displacements(*(Ball.fractions(places[1:, k : k + 1]) - Ball.fractions(places[:1, k : k + 1]) for k in (0, 1)))
     with np.errstate(over="ignore", invalid="ignore"):  # Newton's method may diverge; the solution is then not proven
         boxes = certify(four_bar_system(displacements(places)), u, four_bar_system(exact))
@@ -150,25 +159,25 @@ def find_classes(d: np.ndarray) -> tuple[np.ndarray, Paths, OtherEnds]:
         return _refined(ends.z, ends.status, target)
 
     all_paths = np.arange(start.shape[1])
-    z, status = take(all_paths, FIRST, BENDS[0])
+    z, status = take(all_paths, FIRST_PRECISION, BENDS[0])
     unsettled = np.flatnonzero((status != ACCEPTED) | repeated(z, status == ACCEPTED))
     if len(unsettled):
-        z[:, unsettled], status[unsettled] = take(unsettled, CLOSE, BENDS[0])
+        z[:, unsettled], status[unsettled] = take(unsettled, CLOSE_PRECISION, BENDS[0])
     classes = _merged(z[:, status == ACCEPTED])
     for bend in BENDS[1:]:
-        if classes.shape[1] == CLASSES or not len(unsettled):
+        if classes.shape[1] == CLASS_COUNT or not len(unsettled):
             break
-        more, status_of_more = take(all_paths, CLOSE, bend)
+        more, status_of_more = take(all_paths, CLOSE_PRECISION, bend)
         known, classes = classes.shape[1], _merged(classes, more[:, status_of_more == ACCEPTED])
         if classes.shape[1] == known:
             break
-    missing, ends = CLASSES - classes.shape[1], {}
+    missing, ends = CLASS_COUNT - classes.shape[1], {}
     for code, name in ((INFINITE, "infinite"), (SINGULAR, "singular"), (LOST, "lost")):
         ends[name] = np.flatnonzero(status == code)[: missing - sum(map(len, ends.values()))]
     infinite, singular = len(ends["infinite"]), len(ends["singular"])
-    paths = Paths(CLASSES, classes.shape[1], infinite, singular, missing - infinite - singular)
+    paths = Paths(CLASS_COUNT, classes.shape[1], infinite, singular, missing - infinite - singular)
     which = np.concatenate(list(ends.values()))
-    return classes, paths, OtherEnds(z[:JOINTS, which], tuple(name for name, indices in ends.items() for _ in indices))
+    return classes, paths, OtherEnds(z[:JOINT_UNKNOWNS, which], tuple(name for name, indices in ends.items() for _ in indices))
 
 
 @cache
@@ -180,19 +189,19 @@ def tracker() -> PathTracker:
 @cache
 def start_solutions() -> tuple[np.ndarray, np.ndarray]:
     """Return the stored solutions (16, 1442) and their displacements (16,)."""
-    with np.load(STARTS) as file:
+    with np.load(STARTS_FILE) as file:
         joints, parameters = file["joints"], file["displacements"]
     z, converged = tracker().polish(np.concatenate([joints, turns_of(joints, parameters)]), parameters)
     if not converged.all():
         raise RuntimeError(
-            f"{STARTS} is damaged: {np.count_nonzero(~converged)} of its solutions do not converge; reinstall udkjax"
+            f"{STARTS_FILE} is damaged: {np.count_nonzero(~converged)} of its solutions do not converge; reinstall udkjax"
         )
     return z, parameters
 
 
 def turns_of(joints: np.ndarray, parameters: np.ndarray) -> np.ndarray:
     """Return the turns f (8, M) of four-bars with given joints; the dyads' equations are linear in 1 + f and 1 / (1 + f)."""
-    d, D = parameters[:POINTS, None], parameters[POINTS:, None]
+    d, D = parameters[:DISPLACEMENTS, None], parameters[DISPLACEMENTS:, None]
     rows = []
     for x, X, r, R in (joints[:4], joints[4:]):
         a, A = x - r, X - R
@@ -215,8 +224,8 @@ def power_of_two_near(points: np.ndarray) -> float:
 
 def isotropic(u: np.ndarray) -> np.ndarray:
     """Return x, X, r, R, y, Y, s, S (8, M) from real coordinates."""
-    z = (u[0:JOINTS:2] + 1j * u[1:JOINTS:2]).astype(complex)
-    return np.stack([z, z.conj()], 1).reshape(JOINTS, -1)
+    z = (u[0:JOINT_UNKNOWNS:2] + 1j * u[1:JOINT_UNKNOWNS:2]).astype(complex)
+    return np.stack([z, z.conj()], 1).reshape(JOINT_UNKNOWNS, -1)
 
 
 # --- equal classes
@@ -224,7 +233,7 @@ def isotropic(u: np.ndarray) -> np.ndarray:
 
 def class_keys(z: np.ndarray) -> np.ndarray:
     """Return invariants (4, M) of the six solutions of a class: symmetric functions of the pivots a, b, c of all cognates."""
-    x, X, r, R, y, Y, s, S = z[:JOINTS]
+    x, X, r, R, y, Y, s, S = z[:JOINT_UNKNOWNS]
     a, A, b, B = x - r, X - R, y - s, Y - S
     with np.errstate(all="ignore"):  # ends that are not solutions overflow
         c, C = a - (b - a) * x / (y - x), A - (B - A) * X / (Y - X)
@@ -238,9 +247,9 @@ def repeated(z: np.ndarray, which: np.ndarray) -> np.ndarray:
     return mask
 
 
-def distinct(z: np.ndarray, most: float = CLASSES) -> np.ndarray:
+def distinct(z: np.ndarray, most: float = CLASS_COUNT) -> np.ndarray:
     """Return the indices of the first solution of each class; the tolerance is raised until there are at most `most` classes."""
-    alike = ALIKE
+    alike = SAME_CLASS_TOL
     while True:
         keep = np.ones(z.shape[1], bool)
         for i, j in _pairs(z, alike):
@@ -250,7 +259,7 @@ def distinct(z: np.ndarray, most: float = CLASSES) -> np.ndarray:
         alike *= 10.0
 
 
-def _pairs(z: np.ndarray, alike: float = ALIKE) -> np.ndarray:
+def _pairs(z: np.ndarray, alike: float = SAME_CLASS_TOL) -> np.ndarray:
     """Return pairs i < j of solutions of the same class, sorted."""
     if not z.shape[1]:
         return np.zeros((0, 2), int)
@@ -287,28 +296,28 @@ def _refined(z: np.ndarray, status: np.ndarray, target: np.ndarray) -> tuple[np.
         step = np.linalg.solve(slopes, _residuals(w, p).T.astype(complex)[..., None])[..., 0].T
         size = np.where(singular, np.inf, np.max(np.abs(step), axis=0))
         w = w - np.where(np.isfinite(step), step, 0.0) * columns
-    good = size < REFINED
+    good = size < REFINED_STEP
     z[:, open_ends[good]], status[open_ends[good]] = w[:, good], ACCEPTED
     return z, status
 
 
 def _residuals(z: np.ndarray, p: np.ndarray) -> np.ndarray:
-    f, d, D = z[JOINTS:], p[:POINTS, None], p[POINTS:, None]
+    f, d, D = z[JOINT_UNKNOWNS:], p[:DISPLACEMENTS, None], p[DISPLACEMENTS:, None]
     F, residuals = -f / (1 + f), []
-    for x, X, r, R in (z[:4], z[4:JOINTS]):
+    for x, X, r, R in (z[:4], z[4:JOINT_UNKNOWNS]):
         e, E = d + f * x, D + F * X
         residuals.append(e * (E + R) + E * r)
     return np.concatenate(residuals)
 
 
 def _jacobian(z: np.ndarray, p: np.ndarray) -> np.ndarray:
-    f, d, D = z[JOINTS:], p[:POINTS, None], p[POINTS:, None]
-    F, places = -f / (1 + f), np.arange(POINTS)
+    f, d, D = z[JOINT_UNKNOWNS:], p[:DISPLACEMENTS, None], p[DISPLACEMENTS:, None]
+    F, places = -f / (1 + f), np.arange(DISPLACEMENTS)
     jacobian = np.zeros((z.shape[1], UNKNOWNS, UNKNOWNS), complex)
-    for k, first in ((0, 0), (4, POINTS)):
+    for k, first in ((0, 0), (4, DISPLACEMENTS)):
         x, X, r, R = z[k : k + 4]
         e, E = d + f * x, D + F * X
         for column, slope in enumerate((f * (E + R), F * (e + r), E, e)):
-            jacobian[:, first : first + POINTS, k + column] = slope.T
-        jacobian[:, first + places, JOINTS + places] = (x * (E + R) - X * (e + r) / (1 + f) ** 2).T
+            jacobian[:, first : first + DISPLACEMENTS, k + column] = slope.T
+        jacobian[:, first + places, JOINT_UNKNOWNS + places] = (x * (E + R) - X * (e + r) / (1 + f) ** 2).T
     return jacobian

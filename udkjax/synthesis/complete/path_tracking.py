@@ -16,10 +16,10 @@ from udkjax.native.closing.batch_program import BatchProgram
 FIRST_STEP = 0.02  # first step of t, predicted along the tangent; shortened if too long
 SHORTEST_STEP = 1e-10  # shortest step of t: a path that needs shorter ones ends
 LEAST_SIZE = 1e-2  # least scale of an unknown
-LARGEST = 1e12  # a larger unknown is at infinity; generic solutions reach 1e8
+INFINITE_SIZE = 1e12  # a larger unknown is at infinity; generic solutions reach 1e8
 END_TOL = 1e-12  # bound on the last Newton step, relative to the unknowns: rounding errors if F' is well conditioned
 END_CORRECTIONS = 12  # Newton steps at the end: many more than regular solutions need
-GROWTH = 2.0  # largest growth of a step
+STEP_GROWTH = 2.0  # largest growth of a step
 # Near the end of a path to infinity an unknown varies as a power of 1 - t, an integer or a fraction such as 1/3; on a path to a
 # finite point it does not. If the power is between these two, at 1 - t below NEAR_END, the path goes to infinity.
 LEAST_POWER, MOST_POWER = 0.1, 3.0
@@ -132,7 +132,7 @@ class PathTracker:
         while len(points.path):
             points = self._advance(points, bend, shared, precision)
             size = np.max(np.abs(points.z), axis=0)
-            is_over = (points.t >= 1.0) | (points.step < SHORTEST_STEP) | ~(size < LARGEST) | (points.taken >= most)
+            is_over = (points.t >= 1.0) | (points.step < SHORTEST_STEP) | ~(size < INFINITE_SIZE) | (points.taken >= most)
             if is_over.any():
                 gone = points.take(is_over)
                 out[:, gone.path], reached[gone.path], taken[gone.path] = gone.z, gone.t, gone.taken
@@ -175,7 +175,7 @@ class PathTracker:
         e1, e2 = _relative(first, z), _relative(second, z)
         with np.errstate(invalid="ignore", divide="ignore"):
             good = (e1 < precision.first) & (e2 < precision.second)
-            factor = np.where(good, np.clip((precision.aim / np.maximum(e1, 1e-300)) ** 0.25, 0.3, GROWTH), 0.5)
+            factor = np.where(good, np.clip((precision.aim / np.maximum(e1, 1e-300)) ** 0.25, 0.3, STEP_GROWTH), 0.5)
         following = step * factor
         keep = ~good
         new = _Points(z + second, rate, t, p.z, p.rate, step, following, p.taken + 1, p.path)
@@ -191,7 +191,7 @@ def _ends(p: _Points) -> np.ndarray:
     is_near_end = remaining < NEAR_END
     escapes = is_near_end & (power > LEAST_POWER) & (power < MOST_POWER)
     status = np.where(escapes, INFINITE, np.where(is_near_end & (power <= LEAST_POWER), SINGULAR, LOST))
-    return np.where(np.max(np.abs(p.z), axis=0) < LARGEST, status, INFINITE)
+    return np.where(np.max(np.abs(p.z), axis=0) < INFINITE_SIZE, status, INFINITE)
 
 
 def _predict(p: _Points, step: np.ndarray) -> np.ndarray:

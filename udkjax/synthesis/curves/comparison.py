@@ -19,7 +19,8 @@ import numpy as np
 from udkjax.synthesis.curves.dyad_forms import TINY
 from udkjax.synthesis.curves.targets import CurveTarget
 
-ALONG = 0.02  # weight of tangential moves within neighbours, relative to normal ones: it keeps points from sliding for nothing
+# Weight of tangential moves within neighbours, relative to normal ones: it keeps points from sliding for nothing.
+TANGENTIAL_WEIGHT = 0.02
 
 
 class CurveComparison(NamedTuple):
@@ -76,7 +77,7 @@ def _pairs(offset: np.ndarray, feet: _Feet, blur: float) -> tuple[np.ndarray, np
     """Return rho, its derivatives with respect to the offsets, d/dx + i d/dy, and positive second derivatives xx, xy, yy."""
     length = np.sqrt(np.real(offset) ** 2 + np.imag(offset) ** 2 + blur**2)
     x, y, weight = np.real(feet.normal), np.imag(feet.normal), 1.0 / length
-    along = np.where(feet.is_between, ALONG, 1.0)
+    along = np.where(feet.is_between, TANGENTIAL_WEIGHT, 1.0)
     moments = weight * np.stack([x * x + along * y * y, (1.0 - along) * x * y, y * y + along * x * x])
     return length - blur, weight * offset, moments
 

@@ -10,9 +10,9 @@ from udkjax.positions.following.drive import Drive, drive, only_driver
 from udkjax.printing import PrintedTable, PrintsTable, format_number
 from udkjax.scene.mechanism import Mechanism
 from udkjax.synthesis.curves.curve_search import FoundLinkage, drawn
-from udkjax.synthesis.curves.dyads import SPAN
+from udkjax.synthesis.curves.dyads import SPAN_INDEX
 from udkjax.synthesis.curves.found_mechanism import FoundMechanism
-from udkjax.synthesis.curves.linkage_drawing import PIN, drawing_of, turns_on_its_branch
+from udkjax.synthesis.curves.linkage_drawing import PATH_PIN, drawing_of, turns_on_its_branch
 from udkjax.synthesis.curves.targets import WantedCurve, as_points
 
 
@@ -107,12 +107,12 @@ def confirmed(found: FoundLinkage, wanted: WantedCurve, name: str, unit: str) ->
     return CurveDesign(
         error=found.error,
         mechanism=mechanism,
-        pin=PIN,
+        pin=PATH_PIN,
         curve=as_points(path),
         bars=found.bars,
         size=size,
         transmission=float(np.arcsin(found.sine)),
-        values=start + np.array([0.0, found.x[SPAN]]),
+        values=start + np.array([0.0, found.x[SPAN_INDEX]]),
         turns=True,
         driver=driver,
     )

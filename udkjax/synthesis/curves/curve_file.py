@@ -7,9 +7,9 @@ import numpy as np
 
 from udkjax.scene.outlines.svg import read_svg
 
-COORDINATE = re.compile(r"\W*([xy])(?![a-z])")  # a name of a column, such as "x (mm)"
+COORDINATE_COLUMN = re.compile(r"\W*([xy])(?![a-z])")  # a name of a column, such as "x (mm)"
 FRACTIONS = np.linspace(0.0, 1.0, 49)  # of an arc or a spline
-LIFTED = 1e-6  # of the extent of the drawing: a pen that moves farther is lifted
+LIFTED_DISTANCE = 1e-6  # of the extent of the drawing: a pen that moves farther is lifted
 
 
 def read_curve_file(file: Path) -> np.ndarray:
@@ -30,7 +30,7 @@ def read_curve_file(file: Path) -> np.ndarray:
     pieces = [one.piece.at(FRACTIONS)[0] for one in drawn]
     extent = np.ptp(np.concatenate(pieces), axis=0).max()
     for k in range(1, len(pieces)):
-        if np.hypot(*(pieces[k][0] - pieces[k - 1][-1])) > LIFTED * extent:
+        if np.hypot(*(pieces[k][0] - pieces[k - 1][-1])) > LIFTED_DISTANCE * extent:
             raise ValueError(f"{file.name} must be one stroke: the pen is lifted between {drawn[k - 1].name} and {drawn[k].name}")
     return np.concatenate(pieces)
 
@@ -53,7 +53,7 @@ def read_curve_table(name: str, text: str) -> np.ndarray:
         fields = [field.strip(" \t\"'") for field in line.strip(" \t,;").split(separator)]
         numbers = [_number(field.replace(",", ".")) for field in fields]
         if not points and all(number is None for number in numbers):
-            columns |= {match[1]: j for j, field in enumerate(fields) if (match := COORDINATE.match(field.lower()))}
+            columns |= {match[1]: j for j, field in enumerate(fields) if (match := COORDINATE_COLUMN.match(field.lower()))}
         elif line.strip() and not line.lstrip().startswith("#"):
             chosen = [numbers[j] for j in (columns["x"], columns["y"]) if j < len(numbers)] if len(columns) == 2 else numbers
             if len(chosen) != 2 or None in chosen:

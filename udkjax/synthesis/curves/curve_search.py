@@ -8,26 +8,35 @@ from typing import NamedTuple
 import numpy as np
 
 from udkjax.synthesis.curves.descent import Descended, LinkageLimits, Task, descend, sampling
-from udkjax.synthesis.curves.dyads import BASE, EACH, GEARED, HEAD, SPAN, TAIL, Topology, positions
+from udkjax.synthesis.curves.dyads import (
+    BASE_LINKS,
+    DYAD_NUMBERS,
+    GEARED_CRANK,
+    HEAD_NUMBERS,
+    SPAN_INDEX,
+    TAIL_NUMBERS,
+    Topology,
+    positions,
+)
 from udkjax.synthesis.curves.matching import find_starts
 from udkjax.synthesis.curves.random_linkages import grown
 from udkjax.synthesis.curves.targets import WantedCurve
 from udkjax.threads import thread_count
 
 FEWEST_BARS = 4
-LANES = 16  # linkages of a batch: their numbers stay in the cache
-SAMPLES = 6000  # random linkages of a stage
+BATCH_LINKAGES = 16  # linkages of a batch: their numbers stay in the cache
+RANDOM_LINKAGES = 6000  # random linkages of a stage
 START_DYADS = 3  # most dyads of random linkages; with more, few random curves resemble the target
-TRIES, CHILDREN = 200, 10  # random dyads for each linkage that grows, and how many of them are improved
-BEAM, FAMILY = 10, 3  # linkages of each number of dyads that are kept and grow, and most of them from the same start
+DYAD_TRIES, KEPT_CHILDREN = 200, 10  # random dyads for each linkage that grows, and how many of them are improved
+BEAM_WIDTH, FAMILY_SIZE = 10, 3  # linkages of each number of dyads that are kept and grow, and most of them from the same start
 # blur (RMS radii), weight of violations, steps and linkages left of each part of a stage
 OF_STARTS = ((0.2, 2.0, 10, 48), (0.1, 5.0, 15, 24), (0.05, 20.0, 25, 8))
 OF_GROWTH = ((0.05, 5.0, 12, 40), (0.03, 10.0, 20, 20), (0.02, 30.0, 30, 10))
 OF_FINISH = ((0.01, 100.0, 20), (0.004, 300.0, 20))
-FINISHED = 3  # linkages of each number of dyads that are finished after a round
+FINISHED_PER_ROUND = 3  # linkages of each number of dyads that are finished after a round
 CLOSE_TO = 1e-3  # losses that differ by less, relative, in the same structure are those of the same linkage
-SLACK = 1e-3  # largest violation at the end of a descent, which aims at limits that are tighter by twice as much
-CHECKED = 1440  # angles of a turn at which limits are verified
+LIMIT_SLACK = 1e-3  # largest violation at the end of a descent, which aims at limits that are tighter by twice as much
+CHECKED_ANGLES = 1440  # angles of a turn at which limits are verified
 
 
 class Kept(NamedTuple):
@@ -103,7 +112,7 @@ class CurveSearch:
         self.wanted, self.limits, self.bars = wanted, limits, bars
         self.geared, self.slides = geared and bars > FEWEST_BARS, slides
         self.seed, self.families, self.candidates = seed, 0, 0
-        inner = limits._replace(cosine=limits.cosine - 2 * SLACK, size=limits.size * (1.0 - 2 * SLACK))
+        inner = limits._replace(cosine=limits.cosine - 2 * LIMIT_SLACK, size=limits.size * (1.0 - 2 * LIMIT_SLACK))
         self.coarse = Task(wanted.target(96), sampling(64, 32, wanted.is_whole), inner)
         self.exact = Task(wanted.target(240), sampling(192, 64, wanted.is_whole), inner)
         self.beams: dict[int, Kept] = {}  # of all rounds, by the number of bars; an odd one if there is a second crank
@@ -164,7 +173,9 @@ class CurveSearch:
 
     def _start(self, beams: dict[int, Kept], bars: int, rng: np.random.Generator) -> None:
         dyads, geared = divmod(bars - 2, 2)
-        x, topology = find_starts(self.wanted, self.limits, dyads, SAMPLES, 2 * OF_STARTS[0][3], rng, bool(geared), self.slides)
+        x, topology = find_starts(
+            self.wanted, self.limits, dyads, RANDOM_LINKAGES, 2 * OF_STARTS[0][3], rng, bool(geared), self.slides
+        )
         family = self.families + np.arange(len(x))
         self.families += len(x)
         if len(x):
@@ -175,13 +186,13 @@ class CurveSearch:
             return
         parents = beams[bars]
         x, topology = grown(
-            (parents.x, parents.topology), self.coarse.target, self.coarse.sample, TRIES, CHILDREN, rng, self.slides
+            (parents.x, parents.topology), self.coarse.target, self.coarse.sample, DYAD_TRIES, KEPT_CHILDREN, rng, self.slides
         )
-        children = Kept(x, topology, np.zeros(len(x)), np.repeat(parents.family, CHILDREN))
+        children = Kept(x, topology, np.zeros(len(x)), np.repeat(parents.family, KEPT_CHILDREN))
         self._keep(beams, bars + 2, self._improve(children, OF_GROWTH))
 
     def _keep(self, beams: dict[int, Kept], bars: int, kept: Kept) -> None:
-        beams[bars] = kept.with_others(beams.get(bars)).best(BEAM, FAMILY)
+        beams[bars] = kept.with_others(beams.get(bars)).best(BEAM_WIDTH, FAMILY_SIZE)
 
     def _merge(self) -> None:
         """Add the linkages of this round to those of all rounds."""
@@ -192,7 +203,7 @@ class CurveSearch:
         for part in parts:
             blur, weight, steps, left = part
             after = self._descend(kept.x, kept.topology, self.coarse.weighed(weight), blur, steps)
-            loss = np.where(after.excess < SLACK, after.chamfer, np.inf if part == parts[-1] else after.loss)
+            loss = np.where(after.excess < LIMIT_SLACK, after.chamfer, np.inf if part == parts[-1] else after.loss)
             kept = Kept(after.x, kept.topology, loss, kept.family)
             kept = kept.take(np.argsort(loss, kind="stable")[:left])
         return kept
@@ -200,7 +211,7 @@ class CurveSearch:
     def _descend(self, x: np.ndarray, topology: Topology, task: Task, blur: float, steps: int) -> Descended:
         """Return the results of `descend` for linkages, in batches on all threads."""
         self.candidates += len(x)
-        batches = [slice(k, k + LANES) for k in range(0, len(x), LANES)]
+        batches = [slice(k, k + BATCH_LINKAGES) for k in range(0, len(x), BATCH_LINKAGES)]
         given = task, blur, steps, self.until
         results = list(self.threads.map(lambda part: descend(x[part], topology.take(part), *given), batches))
         return Descended(*(np.concatenate(a) for a in zip(*results, strict=True)))
@@ -208,10 +219,14 @@ class CurveSearch:
     def _finish(self, bars: int) -> bool:
         """Finish the best unfinished linkages of a number of bars; return True if there may be more and none has turned."""
         kept = self.beams[bars]
-        new = [k for k, loss in enumerate(kept.loss) if loss not in self.finished and (k < FINISHED or bars not in self.turned)]
+        new = [
+            k
+            for k, loss in enumerate(kept.loss)
+            if loss not in self.finished and (k < FINISHED_PER_ROUND or bars not in self.turned)
+        ]
         if not new:
             return False
-        new = new[:FINISHED]
+        new = new[:FINISHED_PER_ROUND]
         kept = kept.take(np.array(new))
         x = kept.x
         for blur, weight, steps in OF_FINISH:
@@ -222,14 +237,14 @@ class CurveSearch:
             one = self.verified(*without_idle_dyads(x[k], kept.topology.take(slice(k, k + 1))))
             if one is not None:
                 self.turned.add(bars)
-                self.found[one.bars] = sorted([*self.found.get(one.bars, []), one], key=lambda f: f.error)[:BEAM]
+                self.found[one.bars] = sorted([*self.found.get(one.bars, []), one], key=lambda f: f.error)[:BEAM_WIDTH]
         return bars not in self.turned
 
     def verified(self, x: np.ndarray, topology: Topology) -> FoundLinkage | None:
         """Return the linkage with its error if it is within the limits over the whole turn, else None."""
-        at = positions(x[None], topology, np.arange(CHECKED)[None] * (2 * np.pi / CHECKED), 0.0)
+        at = positions(x[None], topology, np.arange(CHECKED_ANGLES)[None] * (2 * np.pi / CHECKED_ANGLES), 0.0)
         joints = np.concatenate(
-            [at.origins[1:] if topology.ratio[0] else np.delete(at.origins[1:], GEARED - 1, 0), at.ends, at.pin[None]]
+            [at.origins[1:] if topology.ratio[0] else np.delete(at.origins[1:], GEARED_CRANK - 1, 0), at.ends, at.pin[None]]
         )
         cosine, size = float(np.abs(at.cosines).max()), float(np.abs(joints).max())
         if not (cosine <= self.limits.cosine and size <= self.limits.size):
@@ -241,7 +256,7 @@ class CurveSearch:
 def drawn(x: np.ndarray, topology: Topology, is_whole: bool, count: int = 2001) -> np.ndarray:
     """Return the drawn curve of one linkage by complex points; of a whole turn, the last one is the first."""
     share = np.linspace(0.0, 1.0, count)
-    return positions(x[None], topology, x[None, SPAN : SPAN + 1] * share).pin[0]
+    return positions(x[None], topology, x[None, SPAN_INDEX : SPAN_INDEX + 1] * share).pin[0]
 
 
 def without_idle_dyads(x: np.ndarray, topology: Topology) -> tuple[np.ndarray, Topology]:
@@ -250,13 +265,17 @@ def without_idle_dyads(x: np.ndarray, topology: Topology) -> tuple[np.ndarray, T
     needed = {topology.dyads - 1}
     for d in range(topology.dyads - 1, -1, -1):
         if d in needed:
-            needed |= {(link - BASE) // 2 for link in (int(first[d]), int(second[d])) if link >= BASE}
+            needed |= {(link - BASE_LINKS) // 2 for link in (int(first[d]), int(second[d])) if link >= BASE_LINKS}
     dyads = sorted(needed)
-    number = np.arange(BASE + 2 * topology.dyads)
+    number = np.arange(BASE_LINKS + 2 * topology.dyads)
     for new, old in enumerate(dyads):
-        number[BASE + 2 * old : BASE + 2 * old + 2] = BASE + 2 * new, BASE + 2 * new + 1
-    parts = [x[:HEAD], *(x[HEAD + EACH * d : HEAD + EACH * (d + 1)] for d in dyads), x[-TAIL:]]
+        number[BASE_LINKS + 2 * old : BASE_LINKS + 2 * old + 2] = BASE_LINKS + 2 * new, BASE_LINKS + 2 * new + 1
+    parts = [
+        x[:HEAD_NUMBERS],
+        *(x[HEAD_NUMBERS + DYAD_NUMBERS * d : HEAD_NUMBERS + DYAD_NUMBERS * (d + 1)] for d in dyads),
+        x[-TAIL_NUMBERS:],
+    ]
     first, second = number[topology.first[:, dyads]], number[topology.second[:, dyads]]
-    ratio = topology.ratio * ((first == GEARED) | (second == GEARED)).any()
+    ratio = topology.ratio * ((first == GEARED_CRANK) | (second == GEARED_CRANK)).any()
     chosen = Topology(first, second, topology.side[:, dyads], topology.form[:, dyads], ratio)
     return np.concatenate(parts), chosen

@@ -12,11 +12,11 @@ from udkjax.arrays import FULL_TURN
 from udkjax.synthesis.curves.comparison import compare
 from udkjax.synthesis.curves.dyad_forms import RAIL, SLIDE
 from udkjax.synthesis.curves.dyads import (
-    BASE,
-    EACH,
-    HEAD,
-    PHASE,
-    SPAN,
+    BASE_LINKS,
+    DYAD_NUMBERS,
+    HEAD_NUMBERS,
+    SECOND_ANGLE,
+    SPAN_INDEX,
     DyadPositions,
     Topology,
     gradients,
@@ -27,7 +27,7 @@ from udkjax.synthesis.curves.targets import CurveTarget
 
 LONGEST_MOVE = 0.5  # largest change of a number in one step (RMS radii of the target, rad)
 LEAST_SPAN = 0.7  # smallest part of a turn that may draw the curve (rad)
-REACH = 50.0  # largest coordinate of a place on its link; joints are limited by their distance from the target
+LARGEST_COORDINATE = 50.0  # largest coordinate of a place on its link; joints are limited by their distance from the target
 
 
 class LinkageLimits(NamedTuple):
@@ -47,13 +47,13 @@ class LinkageLimits(NamedTuple):
 
     def bounds(self, topology: Topology, is_whole: bool) -> tuple[np.ndarray, np.ndarray]:
         """Return the lower and upper bounds (K, numbers) of the numbers of linkages."""
-        high = np.full((len(topology.form), number_count(topology.dyads)), REACH)
+        high = np.full((len(topology.form), number_count(topology.dyads)), LARGEST_COORDINATE)
         low = -high
-        low[:, PHASE], high[:, PHASE] = -np.inf, np.inf
-        low[:, SPAN], high[:, SPAN] = FULL_TURN if is_whole else LEAST_SPAN, FULL_TURN
+        low[:, SECOND_ANGLE], high[:, SECOND_ANGLE] = -np.inf, np.inf
+        low[:, SPAN_INDEX], high[:, SPAN_INDEX] = FULL_TURN if is_whole else LEAST_SPAN, FULL_TURN
         for d in range(topology.dyads):
-            k, form = HEAD + EACH * d + 4, topology.form[:, d]
-            low[:, k] = np.where(form == SLIDE, -REACH, self.shortest)
+            k, form = HEAD_NUMBERS + DYAD_NUMBERS * d + 4, topology.form[:, d]
+            low[:, k] = np.where(form == SLIDE, -LARGEST_COORDINATE, self.shortest)
             low[:, k + 1] = np.where(form == RAIL, -np.inf, self.shortest)
             high[form == RAIL, k + 1] = np.inf
         return low, high
@@ -76,7 +76,7 @@ class Sampling(NamedTuple):
 
     def angles(self, x: np.ndarray) -> np.ndarray:
         """Return the angles (K, T) of linkages with the numbers x (K, numbers)."""
-        span = x[:, SPAN, None]
+        span = x[:, SPAN_INDEX, None]
         return span * self.share + (FULL_TURN - span) * self.rest
 
 
@@ -121,7 +121,7 @@ class _Violation(NamedTuple):
 
 def _joints(at: DyadPositions) -> np.ndarray:
     """Return the joints P, Q and R of all dyads, complex (3, D, K, T)."""
-    return np.stack([at.origins[BASE::2], at.origins[BASE + 1 :: 2], at.ends])
+    return np.stack([at.origins[BASE_LINKS::2], at.origins[BASE_LINKS + 1 :: 2], at.ends])
 
 
 def _violation(at: DyadPositions, limits: LinkageLimits) -> _Violation:

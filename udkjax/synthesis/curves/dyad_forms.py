@@ -19,7 +19,7 @@ PINS, RAIL, SLIDE = range(3)
 TINY = 1e-30  # squared length (RMS radii), far below rounding: keeps divisions finite where two points coincide
 # Distance (RMS radii) that the line of a sliding link counts to be away from its pin at least: where the pins P and Q of a line
 # through P nearly meet, the link turns too fast, as where its transmission angle vanishes.
-APART = 0.05
+LEAST_ARM = 0.05
 
 
 class Dyads(NamedTuple):
@@ -109,7 +109,7 @@ def place(
         return Dyads(P, Q, R, turn1, turn2, one, two, cosine), R
     length = np.sqrt(square)
     turn1 = way / (length * (side * _sine(one / length, least) + 1j * one / length))
-    return Dyads(P, Q, P + 1j * one * turn1, turn1, turn1, one, two, np.hypot(one, APART) / length), Q
+    return Dyads(P, Q, P + 1j * one * turn1, turn1, turn1, one, two, np.hypot(one, LEAST_ARM) / length), Q
 
 
 def _sine(cosine: np.ndarray, least: float) -> np.ndarray:
@@ -153,6 +153,6 @@ def balance(
     square = np.real(way) ** 2 + np.imag(way) ** 2 + TINY
     a = (moment1 + moment2) / dot(way, turn1)[:, None]
     g, by_one = 1j * a * e1, -a
-    by_one[:, 2] += s * one / np.sqrt((one * one + APART**2) * square)
+    by_one[:, 2] += s * one / np.sqrt((one * one + LEAST_ARM**2) * square)
     g[:, 2] -= s * cosine / square * way
     return DyadForces(g, 0.0, by_one, 0.0)

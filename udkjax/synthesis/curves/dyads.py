@@ -15,10 +15,10 @@ import numpy as np
 
 from udkjax.synthesis.curves.dyad_forms import SLIDE, Dyads, balance, cross, dot, lanes_of_forms, place
 
-BASE = 3  # links without dyads
-HEAD, EACH, TAIL = 6, 6, 2  # numbers before the dyads, of each dyad, and after them
-SPAN, SECOND, PHASE = 2, 3, 5  # indices of the part of the turn, and of the second crank's pivot and angle
-GEARED = 2  # number of the second crank
+BASE_LINKS = 3  # links without dyads
+HEAD_NUMBERS, DYAD_NUMBERS, TAIL_NUMBERS = 6, 6, 2  # numbers before the dyads, of each dyad, and after them
+SPAN_INDEX, SECOND_PIVOT, SECOND_ANGLE = 2, 3, 5  # indices of the part of the turn, and of the second crank's pivot and angle
+GEARED_CRANK = 2  # number of the second crank
 
 
 class Topology(NamedTuple):
@@ -68,7 +68,7 @@ class DyadPositions(NamedTuple):
 
 def number_count(dyads: int) -> int:
     """Return the length of the vector x of a linkage with this number of dyads."""
-    return HEAD + EACH * dyads + TAIL
+    return HEAD_NUMBERS + DYAD_NUMBERS * dyads + TAIL_NUMBERS
 
 
 def _complex(x: np.ndarray, k: int) -> np.ndarray:
@@ -81,24 +81,27 @@ def positions(x: np.ndarray, topology: Topology, theta: np.ndarray, least: float
     Where a dyad cannot be closed, the sine of the angle between its links is replaced by `least`.
     """
     (K, T), D = theta.shape, topology.dyads
-    z, u = np.zeros((BASE + 2 * D, K, T), complex), np.ones((BASE + 2 * D, K, T), complex)
+    z, u = np.zeros((BASE_LINKS + 2 * D, K, T), complex), np.ones((BASE_LINKS + 2 * D, K, T), complex)
     ends, cosines, lanes = np.empty((D, K, T), complex), np.empty((D, K, T)), np.arange(K)
     z[1], u[1] = _complex(x, 0), np.exp(1j * theta)
     if topology.ratio.any():
-        z[GEARED], u[GEARED] = _complex(x, SECOND), np.exp(1j * (topology.ratio[:, None] * theta + x[:, PHASE, None]))
+        z[GEARED_CRANK], u[GEARED_CRANK] = (
+            _complex(x, SECOND_PIVOT),
+            np.exp(1j * (topology.ratio[:, None] * theta + x[:, SECOND_ANGLE, None])),
+        )
     for d in range(D):
-        k = HEAD + EACH * d
+        k = HEAD_NUMBERS + DYAD_NUMBERS * d
         A, B = topology.first[:, d], topology.second[:, d]
         P = z[A, lanes] + u[A, lanes] * _complex(x, k)
         Q = z[B, lanes] + u[B, lanes] * _complex(x, k + 2)
-        z[BASE + 2 * d] = P
+        z[BASE_LINKS + 2 * d] = P
         one, two, side = x[:, k + 4, None], x[:, k + 5, None], topology.side[:, d, None]
         for form, w in lanes_of_forms(topology.form[:, d]):
-            at, z[BASE + 2 * d + 1, w] = place(form, P[w], Q[w], u[B, lanes][w], one[w], two[w], side[w], least)
-            u[BASE + 2 * d, w], u[BASE + 2 * d + 1, w] = at.turn1, at.turn2
+            at, z[BASE_LINKS + 2 * d + 1, w] = place(form, P[w], Q[w], u[B, lanes][w], one[w], two[w], side[w], least)
+            u[BASE_LINKS + 2 * d, w], u[BASE_LINKS + 2 * d + 1, w] = at.turn1, at.turn2
             ends[d, w], cosines[d, w] = at.R, at.cosine
-    last = BASE + 2 * D - 2
-    return DyadPositions(z, u, ends, cosines, z[last] + u[last] * _complex(x, x.shape[1] - TAIL))
+    last = BASE_LINKS + 2 * D - 2
+    return DyadPositions(z, u, ends, cosines, z[last] + u[last] * _complex(x, x.shape[1] - TAIL_NUMBERS))
 
 
 def gradients(
@@ -140,9 +143,9 @@ def gradients(
 
     unit, every = np.zeros((K, 3, T), complex), slice(None)
     unit[:, 0], unit[:, 1] = 1.0, 1j
-    load(L - 2, every, at.pin, unit, x.shape[1] - TAIL)
+    load(L - 2, every, at.pin, unit, x.shape[1] - TAIL_NUMBERS)
     for d in range(D - 1, -1, -1):
-        k, first, second = HEAD + EACH * d, BASE + 2 * d, BASE + 2 * d + 1
+        k, first, second = HEAD_NUMBERS + DYAD_NUMBERS * d, BASE_LINKS + 2 * d, BASE_LINKS + 2 * d + 1
         A, B, one, two = topology.first[:, d], topology.second[:, d], x[:, k + 4, None], x[:, k + 5, None]
         force[first][:, 2] += pulls[0, d] + pushes[d]
         moment[first][:, 2] += cross(at.ends[d] - z[first], pushes[d])
@@ -158,9 +161,9 @@ def gradients(
             moment[B[w], lanes[w]] += found.couple
             load(A[w], w, P[w], force[first, w] - found.force, k)
             load(B[w], w, point[w], force[second, w] + found.force, k + 2)
-    for k, crank in ((0, 1), (SECOND, GEARED)):
+    for k, crank in ((0, 1), (SECOND_PIVOT, GEARED_CRANK)):
         result[:, k] += np.real(force[crank])
         result[:, k + 1] += np.imag(force[crank])
-    result[:, PHASE] += moment[GEARED]
-    result[:, SPAN] += (moment[1] + topology.ratio[:, None, None] * moment[GEARED]) * share
+    result[:, SECOND_ANGLE] += moment[GEARED_CRANK]
+    result[:, SPAN_INDEX] += (moment[1] + topology.ratio[:, None, None] * moment[GEARED_CRANK]) * share
     return result

@@ -15,20 +15,29 @@ from udkjax.scene.drawing.drawn_quantities import Units
 from udkjax.scene.elements.bodies import GROUND
 from udkjax.scene.mechanism import Mechanism
 from udkjax.synthesis.curves.dyad_forms import PINS, RAIL, SLIDE
-from udkjax.synthesis.curves.dyads import BASE, EACH, GEARED, HEAD, SECOND, TAIL, Topology, positions
+from udkjax.synthesis.curves.dyads import (
+    BASE_LINKS,
+    DYAD_NUMBERS,
+    GEARED_CRANK,
+    HEAD_NUMBERS,
+    SECOND_PIVOT,
+    TAIL_NUMBERS,
+    Topology,
+    positions,
+)
 from udkjax.synthesis.curves.targets import WantedCurve
 
-PIN = "P"  # name of the drawing pin
+PATH_PIN = "P"  # name of the drawing pin
 CHECKED_POSITIONS = 720  # positions of a turn at which the constraints must hold, on one branch
 CLOSED_TO = 1e-12  # largest residual of a constraint at these positions, relative to coordinates of its pins, or to a turn
 SAME_BRANCH = 1e-8  # largest distance of a pin from itself by another method, relative to these; beyond, it is another branch
-DENSITY = 7850.0  # kg/m^3, of steel
-WIDTH, THICKNESS = 0.03, 0.01  # of links, relative to the extent of the curve
-WHEELS = 0.6  # sum of the radii of two wheels, relative to the distance of their centres
-THIN = 1e-3  # a plate with a smaller area, relative to the square of its longest side, is drawn as a bar of a given mass
+STEEL_DENSITY = 7850.0  # kg/m^3, of steel
+LINK_WIDTH, LINK_THICKNESS = 0.03, 0.01  # of links, relative to the extent of the curve
+WHEEL_RADII = 0.6  # sum of the radii of two wheels, relative to the distance of their centres
+THIN_AREA = 1e-3  # a plate with a smaller area, relative to the square of its longest side, is drawn as a bar of a given mass
 TURNS_PER_SECOND = 1.0
-SPEED = f"{60 * TURNS_PER_SECOND:g} rpm"
-LETTERS = [a for a in ascii_uppercase if a not in (PIN, "O")]
+CRANK_SPEED = f"{60 * TURNS_PER_SECOND:g} rpm"
+PIN_LETTERS = [a for a in ascii_uppercase if a not in (PATH_PIN, "O")]
 
 LinkPoint = tuple[int, complex]  # number of a link, and a place in its frame
 
@@ -37,21 +46,21 @@ def pins_of_linkage(x: np.ndarray, topology: Topology) -> dict[str, list[LinkPoi
     """Return the pins of a linkage by name, each as a list of the links that it joins, with its place in their frames."""
     pins: dict[str, list[LinkPoint]] = {"O": [(0, complex(x[0], x[1])), (1, 0j)]}
     if topology.ratio[0]:
-        pins["O2"] = [(0, complex(x[SECOND], x[SECOND + 1])), (GEARED, 0j)]
-    names = (f"{a}{k or ''}" for k in count() for a in LETTERS)
+        pins["O2"] = [(0, complex(x[SECOND_PIVOT], x[SECOND_PIVOT + 1])), (GEARED_CRANK, 0j)]
+    names = (f"{a}{k or ''}" for k in count() for a in PIN_LETTERS)
     for d in range(topology.dyads):
-        k, one, two = HEAD + EACH * d, BASE + 2 * d, BASE + 2 * d + 1
+        k, one, two = HEAD_NUMBERS + DYAD_NUMBERS * d, BASE_LINKS + 2 * d, BASE_LINKS + 2 * d + 1
         form = int(topology.form[0, d])
         pins[next(names)] = [(int(topology.first[0, d]), complex(x[k], x[k + 1])), (one, 0j)]
         if form != RAIL:
             pins[next(names)] = [(int(topology.second[0, d]), complex(x[k + 2], x[k + 3])), (two, 0j)]
         if form != SLIDE:
             pins[next(names)] = [(one, complex(x[k + 4])), (two, 0j if form == RAIL else complex(x[k + 5]))]
-    return pins | {PIN: [(BASE + 2 * topology.dyads - 2, complex(x[-TAIL], x[-TAIL + 1]))]}
+    return pins | {PATH_PIN: [(BASE_LINKS + 2 * topology.dyads - 2, complex(x[-TAIL_NUMBERS], x[-TAIL_NUMBERS + 1]))]}
 
 
 def _link_name(number: int) -> str:
-    return f"link{number - BASE + 1}" if number >= BASE else (GROUND, "crank", "crank2")[number]
+    return f"link{number - BASE_LINKS + 1}" if number >= BASE_LINKS else (GROUND, "crank", "crank2")[number]
 
 
 def drawing_of(x: np.ndarray, topology: Topology, wanted: WantedCurve, name: str, unit: str = "m") -> Drawing:
@@ -70,10 +79,10 @@ def drawing_of(x: np.ndarray, topology: Topology, wanted: WantedCurve, name: str
     written = {pin: (z.real, z.imag) for pin, z in places.items()}
     slides = []
     for d in np.flatnonzero(topology.form[0] != PINS).tolist():
-        on = int(topology.second[0, d]) if topology.form[0, d] == RAIL else BASE + 2 * d
-        turn = complex(at.turns[BASE + 2 * d + 1, 0, 0])
-        slides.append({"link": _link_name(BASE + 2 * d + 1), "direction": (turn.real, turn.imag), "on": _link_name(on)})
-    motor, units = {"pin": "O", "speed": SPEED}, {"length": unit}
+        on = int(topology.second[0, d]) if topology.form[0, d] == RAIL else BASE_LINKS + 2 * d
+        turn = complex(at.turns[BASE_LINKS + 2 * d + 1, 0, 0])
+        slides.append({"link": _link_name(BASE_LINKS + 2 * d + 1), "direction": (turn.real, turn.imag), "on": _link_name(on)})
+    motor, units = {"pin": "O", "speed": CRANK_SPEED}, {"length": unit}
     rest: dict[str, Any] = {
         "ground": members[0],
         "motors": [motor],
@@ -83,7 +92,7 @@ def drawing_of(x: np.ndarray, topology: Topology, wanted: WantedCurve, name: str
         "units": units,
     }
     if ratio := int(topology.ratio[0]):
-        wheel = WHEELS * max(abs(places["O2"] - places["O"]), WIDTH * wanted.extent / size) / (1 + abs(ratio))
+        wheel = WHEEL_RADII * max(abs(places["O2"] - places["O"]), LINK_WIDTH * wanted.extent / size) / (1 + abs(ratio))
         belt = "open" if ratio > 0 else "crossed"
         rest["gears"] = [{"links": ["crank", "crank2"], "radii": (abs(ratio) * wheel, wheel), "belt": belt}]
     return Drawing(written, links, **rest)
@@ -98,9 +107,9 @@ def _link(pins: list[str], places: dict[str, complex], extent: float, size: floa
         extent: the extent of the curve (m).
         size: the unit of the drawing in m.
     """
-    shape = {"density": DENSITY, "thickness": THICKNESS * extent / size}
+    shape = {"density": STEEL_DENSITY, "thickness": LINK_THICKNESS * extent / size}
     if len(pins) <= 2:
-        return {"pins": pins, "width": WIDTH * extent / size, **shape}
+        return {"pins": pins, "width": LINK_WIDTH * extent / size, **shape}
     z = np.array([places[pin] for pin in pins])
     order = np.argsort(np.angle(z - z.mean()), kind="stable")
     sides = np.abs(np.roll(z[order], -1) - z[order])
@@ -108,10 +117,10 @@ def _link(pins: list[str], places: dict[str, complex], extent: float, size: floa
     z = z[order]
     area = 0.5 * abs(float(np.sum(np.imag(np.conj(z) * np.roll(z, -1)))))
     named = {"pins": [pins[k] for k in order]}
-    if area > THIN * sides.max() ** 2:
+    if area > THIN_AREA * sides.max() ** 2:
         return named | shape
     length, middle = size * float(sides.max()), z.mean()
-    mass = DENSITY * THICKNESS * extent * WIDTH * extent * length
+    mass = STEEL_DENSITY * LINK_THICKNESS * extent * LINK_WIDTH * extent * length
     return named | {"mass": mass, "centre": (middle.real, middle.imag), "inertia": f"{mass * length**2 / 12!r} kg m2"}
 
 
@@ -132,6 +141,6 @@ def turns_on_its_branch(mechanism: Mechanism, x: np.ndarray, topology: Topology,
     open_by = np.abs(violation(mechanism, motion))
     of_motor = len(mechanism.drivers)  # the last rows, in rad
     pin = wanted.middle + wanted.scale * positions(x[None], topology, FULL_TURN * turns[None], 0.0).pin[0]
-    off = np.abs(np.asarray(motion.path(*locate(mechanism, f"pin.{PIN}", None))) @ [1, 1j] - pin)
+    off = np.abs(np.asarray(motion.path(*locate(mechanism, f"pin.{PATH_PIN}", None))) @ [1, 1j] - pin)
     is_closed = open_by[:, :-of_motor].max() <= CLOSED_TO * size and open_by[:, -of_motor:].max() <= CLOSED_TO * FULL_TURN
     return bool(is_closed and off.max() <= SAME_BRANCH * size)

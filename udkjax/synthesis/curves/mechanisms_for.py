@@ -16,14 +16,15 @@ from udkjax.synthesis.curves.curve_search import FEWEST_BARS, CurveSearch
 from udkjax.synthesis.curves.descent import LinkageLimits
 from udkjax.synthesis.curves.targets import CHAMFER_POINTS, WantedCurve
 
-SIZE = 3.0  # of a mechanism by default: largest distance of its pins from the middle of the curve, in extents of the curve
-TRANSMISSION = float(np.deg2rad(8.0))  # smallest transmission angle by default
-SHORTEST = 0.02  # smallest distance of two joints of a dyad's link, in extents of the curve
-WORTH = 0.03  # fraction by which two more bars must reduce the error to be worth it
-SLIDES = 1 / 3  # fraction of dyads that have a slide, if they may
+# Of a mechanism by default: largest distance of its pins from the middle of the curve, in extents of the curve.
+DEFAULT_SIZE = 3.0
+DEFAULT_TRANSMISSION = float(np.deg2rad(8.0))  # smallest transmission angle by default
+SHORTEST_LENGTH = 0.02  # smallest distance of two joints of a dyad's link, in extents of the curve
+WORTHWHILE_REDUCTION = 0.03  # fraction by which two more bars must reduce the error to be worth it
+SLIDE_FRACTION = 1 / 3  # fraction of dyads that have a slide, if they may
 # Two samples of the same curve differ by a quarter of the distance of their points each way; a search ends when the rest is less.
-ENOUGH = 5e-4
-GROWING = 0.9  # fraction of the time after which linkages are only finished and verified
+ENOUGH_ERROR = 5e-4
+GROWING_FRACTION = 0.9  # fraction of the time after which linkages are only finished and verified
 
 
 @checked
@@ -35,7 +36,7 @@ def mechanisms_for(
     seconds: Annotated[float, NOT_NEGATIVE] = 60.0,
     seed: Annotated[int, NOT_NEGATIVE_COUNT] = 0,
     part: str = "free",
-    transmission: Annotated[float, NOT_NEGATIVE] = TRANSMISSION,
+    transmission: Annotated[float, NOT_NEGATIVE] = DEFAULT_TRANSMISSION,
     rounds: Annotated[int, COUNT] | None = None,
     error: Annotated[float, NOT_NEGATIVE] | None = None,
     geared: bool = True,
@@ -84,10 +85,12 @@ def mechanisms_for(
     if bars < FEWEST_BARS:
         raise ValueError(f"bars must be at least {FEWEST_BARS}: the ground, a crank and a dyad; not {bars}")
     wanted = WantedCurve(curve, part == "whole")
-    search = CurveSearch(wanted, curve_limits(wanted, size, float(transmission)), int(bars), int(seed), geared, SLIDES * slides)
+    search = CurveSearch(
+        wanted, curve_limits(wanted, size, float(transmission)), int(bars), int(seed), geared, SLIDE_FRACTION * slides
+    )
     begun = time.process_time()
     done = _run(search, float(seconds), rounds, error, begun, progress)
-    found = ranked(search.found, wanted, int(results), WORTH, unit)
+    found = ranked(search.found, wanted, int(results), WORTHWHILE_REDUCTION, unit)
     reason = "" if found else "no linkage turned within the limits: give more seconds, a larger size or a smaller transmission"
     return CurveDesigns(tuple(found), done, search.candidates, time.process_time() - begun, reason)
 
@@ -99,13 +102,13 @@ def _run(
 
     `begun` is the CPU time (`time.process_time`) at which the search began; the others are arguments of `mechanisms_for`.
     """
-    done, enough = 0, ENOUGH + 0.5 * search.wanted.length / CHAMFER_POINTS if error is None else error
+    done, enough = 0, ENOUGH_ERROR + 0.5 * search.wanted.length / CHAMFER_POINTS if error is None else error
     try:
         with report_progress(progress, seconds or None, "mechanisms_for") as report:
             for stage in search.stages():
                 if not search.found or (error is not None and search.promises(error)):
                     search.finish()  # from now on there is something to return
-                search.until = begun + GROWING * seconds if search.found or done else np.inf
+                search.until = begun + GROWING_FRACTION * seconds if search.found or done else np.inf
                 best = f", error {search.best:.4g}" if np.isfinite(search.best) else ""
                 report(min(time.process_time() - begun, seconds), stage + best)
                 is_round = stage.endswith("finished")
@@ -125,8 +128,8 @@ def curve_limits(wanted: WantedCurve, size: float | None, transmission: float) -
     """Return the limits of linkages in RMS radii of a curve, from a largest distance (m) and a smallest angle (rad)."""
     if transmission >= np.pi / 2:
         raise ValueError(f"transmission must be an angle below pi / 2 (rad), not {transmission:g}")
-    reach = SIZE * wanted.extent if size is None else float(size)
+    reach = DEFAULT_SIZE * wanted.extent if size is None else float(size)
     needed = wanted.scale * float(np.linalg.norm(wanted.fine, axis=1).max())
     if reach <= needed:
         raise ValueError(f"size must be more than {needed:g} m, the largest distance of the curve from its middle, not {reach:g}")
-    return LinkageLimits(float(np.cos(transmission)), reach / wanted.scale, SHORTEST * wanted.extent / wanted.scale)
+    return LinkageLimits(float(np.cos(transmission)), reach / wanted.scale, SHORTEST_LENGTH * wanted.extent / wanted.scale)

@@ -11,21 +11,21 @@ from udkjax.arrays import FULL_TURN
 from udkjax.synthesis.curves.descent import Sampling
 from udkjax.synthesis.curves.dyad_forms import PINS, RAIL, SLIDE, cross
 from udkjax.synthesis.curves.dyads import (
-    BASE,
-    EACH,
-    GEARED,
-    HEAD,
-    PHASE,
-    SECOND,
-    SPAN,
-    TAIL,
+    BASE_LINKS,
+    DYAD_NUMBERS,
+    GEARED_CRANK,
+    HEAD_NUMBERS,
+    SECOND_ANGLE,
+    SECOND_PIVOT,
+    SPAN_INDEX,
+    TAIL_NUMBERS,
     Topology,
     number_count,
     positions,
 )
 from udkjax.synthesis.curves.targets import CurveTarget
 
-RATIOS = (1, -1, 2, -2, 3, -3, 4, -4, 5, -5)  # turns of a second crank for one of the crank
+GEAR_RATIOS = (1, -1, 2, -2, 3, -3, 4, -4, 5, -5)  # turns of a second crank for one of the crank
 MATCHED_ANGLES = 72  # angles of the crank over a turn
 Linkages = tuple[np.ndarray, Topology]
 
@@ -38,19 +38,19 @@ def turn_angles(K: int) -> np.ndarray:
 def random_linkages(K: int, dyads: int, rng: np.random.Generator, geared: bool = False, slides: float = 0.0) -> Linkages:
     """Return K random linkages with cranks of about unit length; geared ones begin with a five-bar of two cranks."""
     x = np.zeros((K, number_count(dyads)))
-    x[:, SPAN] = FULL_TURN
+    x[:, SPAN_INDEX] = FULL_TURN
     first, second = np.ones((K, dyads), int), np.zeros((K, dyads), int)
-    ratio = rng.choice(RATIOS, K) if geared else np.zeros(K, int)
+    ratio = rng.choice(GEAR_RATIOS, K) if geared else np.zeros(K, int)
     topology = Topology(first, second, rng.choice([-1.0, 1.0], (K, dyads)), random_forms((K, dyads), slides, rng), ratio)
-    x[:, HEAD] = np.exp(rng.normal(0.0, 0.3, K))
+    x[:, HEAD_NUMBERS] = np.exp(rng.normal(0.0, 0.3, K))
     pivot = np.exp(rng.normal(0.7, 0.5, K)) * np.exp(1j * rng.uniform(0.0, FULL_TURN, K))
-    at = HEAD + 2
+    at = HEAD_NUMBERS + 2
     if geared:
-        at, second[:, 0] = SECOND, GEARED
-        x[:, PHASE], x[:, HEAD + 2] = rng.uniform(0.0, FULL_TURN, K), np.exp(rng.normal(-0.3, 0.5, K))
+        at, second[:, 0] = SECOND_PIVOT, GEARED_CRANK
+        x[:, SECOND_ANGLE], x[:, HEAD_NUMBERS + 2] = rng.uniform(0.0, FULL_TURN, K), np.exp(rng.normal(-0.3, 0.5, K))
     x[:, at], x[:, at + 1] = np.real(pivot), np.imag(pivot)
     for d in range(dyads):
-        k, links = HEAD + EACH * d, BASE + 2 * d
+        k, links = HEAD_NUMBERS + DYAD_NUMBERS * d, BASE_LINKS + 2 * d
         if d:
             likely = np.array([1.0, 0.5, 0.5 * geared, *[1.0] * (2 * d - 2), 2.0, 2.0])  # rather the last links: deeper linkages
             A, B = rng.choice(links, (2, K), p=likely / likely.sum())
@@ -58,15 +58,15 @@ def random_linkages(K: int, dyads: int, rng: np.random.Generator, geared: bool =
             first[:, d], second[:, d] = A, B
             x[:, k : k + 2], x[:, k + 2 : k + 4] = random_places(x, topology, A, rng), random_places(x, topology, B, rng)
         x[:, k + 4 : k + 6] = closing_lengths(x, topology, turn_angles(K), d, rng)
-    length = link_lengths(x, topology, np.full(K, BASE + 2 * dyads - 2))
+    length = link_lengths(x, topology, np.full(K, BASE_LINKS + 2 * dyads - 2))
     x[:, -2], x[:, -1] = rng.uniform(-1.0, 2.0, K) * length, rng.normal(0.0, 1.0, K) * length
     return x, topology
 
 
 def closing_lengths(x: np.ndarray, topology: Topology, theta: np.ndarray, d: int, rng: np.random.Generator) -> np.ndarray:
     """Return random numbers `one` and `two` (K, 2) of dyad d, with which it closes at all angles `theta` (K, T) of the crank."""
-    k = HEAD + EACH * (d + 1)
-    known = np.concatenate([x[:, :k], x[:, -TAIL:]], 1)
+    k = HEAD_NUMBERS + DYAD_NUMBERS * (d + 1)
+    known = np.concatenate([x[:, :k], x[:, -TAIL_NUMBERS:]], 1)
     known[:, k - 2 : k] = 1.0
     first, second, side, form = (a[:, : d + 1] for a in topology[:4])
     pinned = np.concatenate([form[:, :d], np.full((len(x), 1), PINS)], 1)
@@ -89,9 +89,11 @@ def random_forms(shape: tuple[int, ...], slides: float, rng: np.random.Generator
 
 def link_lengths(x: np.ndarray, topology: Topology, link: np.ndarray) -> np.ndarray:
     """Return a usual length (K,) of one link of each linkage, whose numbers are `link` (K,)."""
-    rows, (dyad, other) = np.arange(len(x)), np.divmod(np.maximum(link - BASE, 0), 2)
+    rows, (dyad, other) = np.arange(len(x)), np.divmod(np.maximum(link - BASE_LINKS, 0), 2)
     form = topology.form[rows, np.minimum(dyad, topology.dyads - 1)]
-    return x[rows, np.minimum(HEAD + EACH * dyad + 4 + np.where(form == PINS, other, form == SLIDE), x.shape[1] - 1)]
+    return x[
+        rows, np.minimum(HEAD_NUMBERS + DYAD_NUMBERS * dyad + 4 + np.where(form == PINS, other, form == SLIDE), x.shape[1] - 1)
+    ]
 
 
 def random_places(x: np.ndarray, topology: Topology, link: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -99,7 +101,7 @@ def random_places(x: np.ndarray, topology: Topology, link: np.ndarray, rng: np.r
     K, length = len(x), link_lengths(x, topology, link)
     between = np.stack([rng.uniform(-0.6, 1.6, K) * length, rng.normal(0.0, 0.5, K) * length], 1)
     about = rng.normal(0.0, np.where(link == 0, 2.0, 0.8)[:, None], (K, 2))
-    return np.where((link >= BASE)[:, None], between, about)
+    return np.where((link >= BASE_LINKS)[:, None], between, about)
 
 
 def grown(
@@ -118,16 +120,16 @@ def grown(
     """
     x, topology = linkages
     (K, D), n = topology.first.shape, len(x) * tries
-    parent, links = np.repeat(np.arange(K), tries), BASE + 2 * D
+    parent, links = np.repeat(np.arange(K), tries), BASE_LINKS + 2 * D
     x, topology = x[parent], topology.take(parent)
     A = np.full(n, links - 2)
     has_second = topology.ratio != 0
     B = rng.integers(0, links - 2 + has_second)
-    B += (B >= GEARED) & ~has_second
+    B += (B >= GEARED_CRANK) & ~has_second
     B += links - 2 == B
     B = np.where(rng.random(n) < 0.3, 0, B)
-    k = HEAD + EACH * D
-    y = np.concatenate([x[:, :k], x[:, -TAIL:], random_places(x, topology, B, rng), np.ones((n, 2)), np.zeros((n, 2))], 1)
+    k = HEAD_NUMBERS + DYAD_NUMBERS * D
+    y = np.concatenate([x[:, :k], x[:, -TAIL_NUMBERS:], random_places(x, topology, B, rng), np.ones((n, 2)), np.zeros((n, 2))], 1)
     side = rng.choice([-1.0, 1.0], (n, 1))
     added = A[:, None], B[:, None], side, random_forms((n, 1), slides, rng)
     first, second, branch, form = (np.concatenate(pair, 1) for pair in zip(topology[:4], added, strict=True))

@@ -8,10 +8,12 @@ from scipy.spatial import cKDTree
 from udkjax.requirements import require_finite
 
 CHAMFER_POINTS = 2000  # points of each curve by which distances are measured
-FEWEST = 3  # points of a curve
-LARGEST = 1e30  # extent (m) of a curve, and one over the smallest: the fifth powers of both, in moments of inertia, are finite
-CLOSED = 0.02  # a curve whose ends are nearer, relative to its length, is closed
-SPACING, SPACED = 1.25, 12  # so is one of at least so many points whose ends are nearer than their usual distance, times this
+FEWEST_POINTS = 3  # points of a curve
+# Extent (m) of a curve, and one over the smallest: the fifth powers of both, in moments of inertia, are finite.
+LARGEST_EXTENT = 1e30
+CLOSED_GAP = 0.02  # a curve whose ends are nearer, relative to its length, is closed
+# So is one of at least so many points whose ends are nearer than their usual distance, times this.
+CLOSED_SPACING, MANY_POINTS = 1.25, 12
 
 
 def read_curve(curve: object, name: str = "curve") -> np.ndarray:
@@ -24,14 +26,15 @@ def read_curve(curve: object, name: str = "curve") -> np.ndarray:
     points = np.asarray(curve, float)
     if points.ndim != 2 or points.shape[1] != 2:
         raise ValueError(f"{name} must have the shape (n, 2), one row x, y for each point, not {points.shape}")
-    if len(points) < FEWEST:
-        raise ValueError(f"{name} must have at least {FEWEST} points, not {len(points)}")
+    if len(points) < FEWEST_POINTS:
+        raise ValueError(f"{name} must have at least {FEWEST_POINTS} points, not {len(points)}")
     size = float(np.hypot(*np.ptp(points, axis=0)))
     if not size > 4 * np.finfo(float).eps * np.abs(points).max():
         raise ValueError(f"{name} has no size: all of its points coincide")
-    if not 1.0 / LARGEST < size < LARGEST:
+    if not 1.0 / LARGEST_EXTENT < size < LARGEST_EXTENT:
         raise ValueError(
-            f"{name} has an extent of {size:.3g} m: give it in another unit, between {1 / LARGEST:g} and {LARGEST:g}"
+            f"{name} has an extent of {size:.3g} m: give it in another unit, "
+            f"between {1 / LARGEST_EXTENT:g} and {LARGEST_EXTENT:g}"
         )
     step = np.linalg.norm(np.diff(points, axis=0), axis=1)
     return points[np.concatenate([[True], step > np.finfo(float).eps * size])]
@@ -40,8 +43,8 @@ def read_curve(curve: object, name: str = "curve") -> np.ndarray:
 def closes(points: np.ndarray) -> bool:
     """Return True if the ends of a curve nearly meet, or if only the last side of a polygon of many points is missing."""
     step = np.linalg.norm(np.diff(points, axis=0), axis=1)
-    usual = SPACING * float(np.median(step)) if len(points) >= SPACED else 0.0
-    return float(np.linalg.norm(points[0] - points[-1])) <= max(CLOSED * float(step.sum()), usual)
+    usual = CLOSED_SPACING * float(np.median(step)) if len(points) >= MANY_POINTS else 0.0
+    return float(np.linalg.norm(points[0] - points[-1])) <= max(CLOSED_GAP * float(step.sum()), usual)
 
 
 def resampled(points: np.ndarray, count: int, is_closed: bool = False) -> np.ndarray:

@@ -114,7 +114,7 @@ class PinClearance:
 ToleranceLike: TypeAlias = "float | str | Tolerance | PinClearance"
 
 # ISO 286-1:2010, table 1: standard tolerances (um) of nominal sizes up to these (mm).
-SIZES = (3, 6, 10, 18, 30, 50, 80, 120, 180, 250, 315, 400, 500)
+NOMINAL_SIZES = (3, 6, 10, 18, 30, 50, 80, 120, 180, 250, 315, 400, 500)
 GRADES = {
     5: (4, 5, 6, 8, 9, 11, 13, 15, 18, 20, 23, 25, 27),
     6: (6, 8, 9, 11, 13, 16, 19, 22, 25, 29, 32, 36, 40),
@@ -142,9 +142,9 @@ def grade(text: str, length: float) -> Tolerance | None:
     size = abs(length) * 1e3
     if int(digits) not in GRADES:
         raise ValueError(f"{quote(text)}: grades are {min(GRADES)} to {max(GRADES)}; give the deviation in mm")
-    if not 0.0 < size <= SIZES[-1]:
-        raise ValueError(f"{quote(text)}: a length of {size:g} mm has no grade, only one up to {SIZES[-1]} mm")
-    width = GRADES[int(digits)][next(k for k, most in enumerate(SIZES) if size <= most)] * 1e-6
+    if not 0.0 < size <= NOMINAL_SIZES[-1]:
+        raise ValueError(f"{quote(text)}: a length of {size:g} mm has no grade, only one up to {NOMINAL_SIZES[-1]} mm")
+    width = GRADES[int(digits)][next(k for k, most in enumerate(NOMINAL_SIZES) if size <= most)] * 1e-6
     low, high = _SIDES[letters]
     return Tolerance((low * width, high * width), "m")
 

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-STEP = 3.0**0.5  # of differences, in standard deviations
+DIFFERENCE_STEP = 3.0**0.5  # of differences, in standard deviations
 
 
 class Quadratic(NamedTuple):
@@ -52,14 +52,14 @@ def quadratic(function: Callable[[np.ndarray], np.ndarray], count: int) -> Quadr
         function: returns G measures (N, G) at N vectors of deviations (N, K); it is called once.
         count: the number K of deviations.
     """
-    units, pairs = STEP * np.eye(count), list(combinations(range(count), 2))
+    units, pairs = DIFFERENCE_STEP * np.eye(count), list(combinations(range(count), 2))
     signs = [(1, 1), (1, -1), (-1, 1), (-1, -1)]
     crossed = [a * units[i] + b * units[j] for i, j in pairs for a, b in signs]
     found = function(np.concatenate([np.zeros((1, count)), units, -units, np.reshape(crossed, (-1, count))]))
     middle, plus, minus, rest = np.split(found, [1, 1 + count, 1 + 2 * count])
     curvature = np.zeros((found.shape[1], count, count))
     for k in range(count):
-        curvature[:, k, k] = (plus[k] - 2.0 * middle[0] + minus[k]) / STEP**2
+        curvature[:, k, k] = (plus[k] - 2.0 * middle[0] + minus[k]) / DIFFERENCE_STEP**2
     for (i, j), f in zip(pairs, rest.reshape(len(pairs), 4, found.shape[1]), strict=True):
-        curvature[:, i, j] = curvature[:, j, i] = (f[0] - f[1] - f[2] + f[3]) / (4.0 * STEP**2)
-    return Quadratic(middle[0], ((plus - minus) / (2.0 * STEP)).T, curvature)
+        curvature[:, i, j] = curvature[:, j, i] = (f[0] - f[1] - f[2] + f[3]) / (4.0 * DIFFERENCE_STEP**2)
+    return Quadratic(middle[0], ((plus - minus) / (2.0 * DIFFERENCE_STEP)).T, curvature)

@@ -15,7 +15,7 @@ import udkjax as udk
 from tests.choices import fast
 from tests.friction import rubbing
 from tests.integrate.events.run.passing import by_the_loop, counted
-from udkjax.native.module.layout import SHARE
+from udkjax.native.module.layout import MEMBERS_PER_THREAD
 
 TS = np.linspace(0.0, 2.0, 41)
 CHAIN = rubbing(udk.library.chain(5, 0.4), 0.15, 0.005, law="set-valued")
@@ -89,7 +89,7 @@ def test_the_record_of_events_is_filled_again_and_again(monkeypatch):
 
 
 def test_lanes_pass_events_as_single_runs_do():
-    scale = np.linspace(0.2, 3.0, 2 * SHARE + 5)
+    scale = np.linspace(0.2, 3.0, 2 * MEMBERS_PER_THREAD + 5)
 
     def run(scale):
         forces = [eqx.tree_at(lambda x: x.coefficient, x, scale * x.coefficient) for x in CHAIN._forces]

@@ -19,10 +19,10 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from udkjax.complementarity.linear import diagonal, eliminate, solve_complementarity
-from udkjax.integrate.events.instant.impacts import ATTACHABLE, CARRIED, ContactRows
+from udkjax.integrate.events.instant.impacts import ATTACH_TOL, CARRIED_TOL, ContactRows
 from udkjax.integrate.events.instant.runs import RunState
 from udkjax.integrate.events.instant.system import System
-from udkjax.integrate.events.law.crossings import ZERO
+from udkjax.integrate.events.law.crossings import ZERO_TOL
 from udkjax.transforms.gradients import stop_gradients
 
 
@@ -46,13 +46,13 @@ def close_contacts(system: System, gaps: Gaps, after: RunState) -> Float[Any, "*
     plan, xp, (rows, g, scale, counts) = system.plan, system.xp, gaps
     is_joint = np.isin(np.arange(plan.count), plan.forwards)
     rests = plan.held(after.phase, xp) & (plan.impacts | is_joint)
-    b, floor = xp.where(plan.impacts, g, 0.0), ZERO * scale
-    counts = counts & ~rests & (xp.abs(b) <= ATTACHABLE * scale)
+    b, floor = xp.where(plan.impacts, g, 0.0), ZERO_TOL * scale
+    counts = counts & ~rests & (xp.abs(b) <= ATTACH_TOL * scale)
     if xp is np and not ((xp.abs(b) > floor) & (rests | (counts & (b < 0)))).any():
         return after.q
     # The derivatives of W are those of a change so small that they do not count; those of gaps close the contacts together.
     W, directions = (rows.W, rows.directions) if xp is np else stop_gradients((rows.W, rows.directions))
-    least = CARRIED * diagonal(W, xp)
+    least = CARRIED_TOL * diagonal(W, xp)
     remainder, closes = eliminate(W, rests, least, xp)
     counts = counts & (diagonal(remainder, xp) > least)
     solution = solve_complementarity(W, b, counts, floor, closes, xp)

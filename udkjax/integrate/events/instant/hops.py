@@ -13,14 +13,15 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool
 
-from udkjax.integrate.events.instant.impacts import CLOSED, REST
-from udkjax.integrate.events.instant.runs import RECORD, MemberIndices, MemberRuns, take
+from udkjax.integrate.events.instant.impacts import CLOSED_TOL, REST_SPEED
+from udkjax.integrate.events.instant.runs import RECORD_FIELDS, MemberIndices, MemberRuns, take
 from udkjax.integrate.events.instant.system import System, condition_values
-from udkjax.integrate.events.law.crossings import ZERO, ZERO_RATE_2
+from udkjax.integrate.events.law.crossings import ZERO_RATE_2_TOL, ZERO_TOL
 
-TIME_FIELD = RECORD.index("event_time")
-# Longest time (T) from the top of a hop to its end: the state at the top follows by a step of third order, with an error of ZERO.
-LONGEST = ZERO ** (1 / 3)
+TIME_FIELD = RECORD_FIELDS.index("event_time")
+# Longest time (T) from the top of a hop to its end. The state at the top follows by a step of third order, with an error of
+# ZERO_TOL.
+LONGEST_FALL = ZERO_TOL ** (1 / 3)
 
 
 def ends_hop(system: System, runs: MemberRuns) -> Bool[Any, "B"]:
@@ -39,9 +40,9 @@ def return_to_top(system: System, runs: MemberRuns, members: MemberIndices) -> M
     values, _ = condition_values(system, members, landing)
     scale = xp.maximum(values.scale, take(runs.scale, members))[row, event]
     rate, rate_2, unit = values.rate[row, event], values.rate_2[row, event], scale * system_rate
-    falls = (rate < 0) & (rate > -REST * unit) & (rate_2 < -ZERO_RATE_2 * unit * system_rate)
+    falls = (rate < 0) & (rate > -REST_SPEED * unit) & (rate_2 < -ZERO_RATE_2_TOL * unit * system_rate)
     since = xp.where(falls, rate / xp.where(falls, rate_2, -1.0), 0.0)  # the time from the top to the landing
-    is_small = falls & (since * system_rate <= LONGEST) & (-rate * since <= 2 * CLOSED * scale)
+    is_small = falls & (since * system_rate <= LONGEST_FALL) & (-rate * since <= 2 * CLOSED_TOL * scale)
     h, a = xp.where(is_small, since, 0.0)[:, None], values.a
     start = landing._replace(t=t - h[:, 0], q=q - h * v + h**2 / 2 * a, v=v - h * a)
     at_start = system.look(members, start)
@@ -53,7 +54,7 @@ def return_to_top(system: System, runs: MemberRuns, members: MemberIndices) -> M
     h = xp.where(is_small, rate / xp.where(rate_2 < 0, rate_2, -1.0), 0.0)[:, None]
     t, q, v = start.t - h[:, 0], q - h * v, v - h * at_start.a
     # The motion is smooth, and the contact has risen since the last event: at the top itself there is no further event.
-    returns = is_small & (rate_2 < 0) & (xp.abs(h[:, 0]) <= LONGEST * since) & (t - last > since / 2)
+    returns = is_small & (rate_2 < 0) & (xp.abs(h[:, 0]) <= LONGEST_FALL * since) & (t - last > since / 2)
     before = runs.state(members)
     return runs.put(
         members,

@@ -54,21 +54,21 @@ from udkjax.complementarity.rubbing_impacts import RubbingContacts, rubbing_impa
 from udkjax.complementarity.stick_or_slip import AT_REST
 from udkjax.equations import udwadia_kalaba as uk
 from udkjax.equations.states.textbook import TextbookEquations
-from udkjax.integrate.events.law.crossings import ZERO_RATE, ZERO_RATE_2, ConditionValues
+from udkjax.integrate.events.law.crossings import ZERO_RATE_2_TOL, ZERO_RATE_TOL, ConditionValues
 from udkjax.transforms.gradients import stop_gradients
 
-BLOCKED, CLOSED, STILL, CARRIED = AT_REST.blocked, AT_REST.closed, AT_REST.still, AT_REST.carried
-BLOCKED_IN_SYSTEM = 1e-13  # as BLOCKED, where u . u is a difference of products, with their rounding errors
+BLOCKED_TOL, CLOSED_TOL, STILL_TOL, CARRIED_TOL = AT_REST.blocked, AT_REST.closed, AT_REST.still, AT_REST.carried
+BLOCKED_IN_SYSTEM_TOL = 1e-13  # as BLOCKED_TOL, where u . u is a difference of products, with their rounding errors
 # Speed before or after an impact, relative to a condition's scale per T: a pressed contact that is slower is at rest. Its rebound
 # would rise by 1e-10 of that scale, a hundredth of the accuracy at usual tolerances.
-REST = 1e-5
+REST_SPEED = 1e-5
 # Bound on W_ij, relative to |u_i| |u_j|: below it, contacts i and j do not act on one another, and each has its own event. This
 # ratio is a cosine, with rounding errors of 1e-15 times the condition number of the constraints, up to a thousand.
-COUPLED = 1e-12
+COUPLING_TOL = 1e-12
 
 # Largest gap of an attached joint, relative to L, or in rad; and largest change of velocities, relative to the fastest, by which
 # they violate the other constraints.
-ATTACHABLE = 1e-6
+ATTACH_TOL = 1e-6
 
 OPEN, TOUCHES, SLOW = 0, 1, 2  # the states of a contact at an event: not closed, closed, closed and without restitution
 
@@ -138,7 +138,7 @@ def rows_of_directions(
     """Return the rows of contacts where M is diagonal, from the directions of impulses, M^(-1/2) u, and 1 / M."""
     mobility = inverse_mass[..., None, :]
     W, given = directions / mobility @ directions.swapaxes(-1, -2), (normals**2 * mobility).sum(-1)
-    return ContactRows(W, directions, (directions**2 / mobility).sum(-1) > BLOCKED * given)
+    return ContactRows(W, directions, (directions**2 / mobility).sum(-1) > BLOCKED_TOL * given)
 
 
 def rows_of_mobilities(
@@ -147,7 +147,7 @@ def rows_of_mobilities(
     """Return the rows of contacts where M need not be diagonal, from M^(-1) n^T and P M^(-1) n^T: W = n P M^(-1) n^T."""
     W = normals @ directions.swapaxes(-1, -2)
     size, given = (normals * directions).sum(-1), (normals * mobilities).sum(-1)
-    return ContactRows((W + W.swapaxes(-1, -2)) / 2, directions, size > BLOCKED_IN_SYSTEM * given)
+    return ContactRows((W + W.swapaxes(-1, -2)) / 2, directions, size > BLOCKED_IN_SYSTEM_TOL * given)
 
 
 def impulses_of_impact(
@@ -170,7 +170,7 @@ def impulses_of_impact(
     """
     solution = solve_complementarity(rows.W, (1 + restitution) * rate, closed & rows.free, floor, xp)
     after = rate + times(rows.W, solution.x)
-    limit = floor + STILL * _largest(rate, closed, xp)
+    limit = floor + STILL_TOL * _largest(rate, closed, xp)
     return Impulses(solution.x, after, xp.any(closed & (after < -limit), -1))
 
 
@@ -204,7 +204,7 @@ def impulses_with_friction(
     given = RubbingContacts(W, speeds, restitution[..., normals], coefficient, takes_part)
     impulse = (rubbing_impact(given, rubbing, xp) / size) @ np.eye(E)[columns]
     after = rate + times(rows.W, impulse)
-    limit = floor + STILL * _largest(rate, closed, xp)
+    limit = floor + STILL_TOL * _largest(rate, closed, xp)
     return Impulses(impulse, after, xp.any(closed & ~(after >= -limit), -1))  # NaN: there is no solution
 
 
@@ -228,9 +228,9 @@ def contact_states(
     h, rate, rate_2, _, scale = before
     E, system = h.shape[-1], contacts.rate[..., None]
     unit, impacts, is_own = scale * system, contacts.impacts, np.arange(E) == (k % E)[..., None]
-    closed = impacts & (held | ((xp.abs(h) <= CLOSED * scale) & (rate <= ZERO_RATE * unit)) | is_own)
+    closed = impacts & (held | ((xp.abs(h) <= CLOSED_TOL * scale) & (rate <= ZERO_RATE_TOL * unit)) | is_own)
     size = xp.sqrt(diagonal(W, xp))
-    acts = xp.abs(W) > COUPLED * size[..., None, :] * size[..., :, None]
+    acts = xp.abs(W) > COUPLING_TOL * size[..., None, :] * size[..., :, None]
     # A contact with friction acts by the row of its sliding, too, though its normal impulse may leave the other contact alone.
     sliding = np.where(contacts.tangents >= 0, contacts.tangents, np.arange(E))
     acts = acts | acts[..., sliding, :]
@@ -239,8 +239,8 @@ def contact_states(
     for _ in range(int(np.sum(impacts)) - 1):
         joined = joined | xp.any(acts & joined[..., None, :], axis=-1)
     closed = closed & joined
-    slow = xp.abs(rate) < REST * unit
-    pressed = rate_2 < -ZERO_RATE_2 * unit * system
+    slow = xp.abs(rate) < REST_SPEED * unit
+    pressed = rate_2 < -ZERO_RATE_2_TOL * unit * system
     return xp.where(closed, xp.where(slow & pressed & ~held, SLOW, TOUCHES), OPEN)
 
 
@@ -272,7 +272,7 @@ def hit_contacts(
     """
     stop: Callable[[Any], Any] = (lambda x: x) if xp is np else stop_gradients
     scale, system = stop(before.scale), contacts.rate[..., None]
-    floor = ZERO_RATE * scale * system
+    floor = ZERO_RATE_TOL * scale * system
     closed = contact_states(contacts, k, held, before, rows.W, xp) if known is None else known.closed
     restitution = xp.where(closed == SLOW, 0.0, contacts.restitution)
     touches = closed > OPEN
@@ -293,17 +293,17 @@ def hit_contacts(
         is_held = xp.where(contacts.impacts, known.held, held)  # locks of joints begin later, at the places of the joints then
         return ContactChanges(velocities(impact), closed, no, is_held, is_held, no, no, impact.remaining)
     # The set of held contacts is discrete, and has no derivatives.
-    W, fixed_rate, pressed = stop(rows.W), stop(rate), ZERO_RATE_2 * scale * system**2
+    W, fixed_rate, pressed = stop(rows.W), stop(rate), ZERO_RATE_2_TOL * scale * system**2
     may_stay = (touches) & rows.free & (np.arange(rate.shape[-1]) + rate.shape[-1] != k[..., None])
-    still = xp.maximum(floor, STILL * _largest(fixed_rate, touches, xp))
-    slow = xp.maximum(still, REST * scale * system)
+    still = xp.maximum(floor, STILL_TOL * _largest(fixed_rate, touches, xp))
+    slow = xp.maximum(still, REST_SPEED * scale * system)
     impact = impulses(restitution)
     stays, is_held = may_stay & (stop(impact.rate) <= slow), xp.where(touches, False, held)
     ends, carried = xp.zeros_like(stays), xp.zeros_like(stays)
     hits = (closed == TOUCHES) & ~held & (fixed_rate < -floor)
     if xp is not np or stays.any():
         pull = second_rates(stop(velocities(impact)))
-        weak = xp.maximum(pressed, STILL * _largest(pull, stays, xp))
+        weak = xp.maximum(pressed, STILL_TOL * _largest(pull, stays, xp))
 
         def pressed_and_idle(stays: Any) -> tuple[Any, Any]:
             """Return masks of the contacts that are pressed, and of all that do not open."""
@@ -341,6 +341,6 @@ def _depends(
     """Return a mask of the contacts that are not held, but whose rows depend on those of the held ones."""
     among = np.flatnonzero(impacts)
     W, basis, places = W[..., among, :][..., among], held[..., among], np.eye(len(impacts), dtype=bool)[among]
-    least = CARRIED * diagonal(W, xp)
+    least = CARRIED_TOL * diagonal(W, xp)
     remainder, _ = eliminate(W, basis, least, xp)
     return xp.any((~basis & (diagonal(remainder, xp) <= least))[..., None] & places, axis=-2)

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Int
 from udkjax.complementarity.stick_or_slip import FrictionModes
 from udkjax.integrate.events.instant.closing import Gaps, close_contacts
 from udkjax.integrate.events.instant.impacts import (
-    ATTACHABLE,
+    ATTACH_TOL,
     OPEN,
     ContactChanges,
     Contacts,
@@ -110,7 +110,7 @@ def _apply_event(
         # A driver may demand velocities that the new joints do not allow: v1 is then a compromise, or violates either row.
         unit = take(system.coordinates, members)
         moved, slower, faster = (xp.max(xp.abs(x) / unit, axis=-1) for x in (q1 - q, v1, v))
-        is_open = (moved > ATTACHABLE) | (left > ATTACHABLE * xp.maximum(slower, faster))
+        is_open = (moved > ATTACH_TOL) | (left > ATTACH_TOL * xp.maximum(slower, faster))
         blocked = adds & (is_open if xp is np else stop_gradients(is_open))
         q, v = (xp.where(adds[:, None], x, y) for x, y in ((q1, q), (v1, v)))
     acts = ((releases | xp.asarray(plan.changes)[e]) & ~xp.asarray(plan.slides)[e])[:, None]

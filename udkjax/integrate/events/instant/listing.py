@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from udkjax.integrate.events.instant.runs import RECORD, EventRun
+from udkjax.integrate.events.instant.runs import RECORD_FIELDS, EventRun
 from udkjax.integrate.events.law.event import Event
 from udkjax.integrate.events.law.kinks import MOST_KINKS
 from udkjax.integrate.events.law.phases import Phases
@@ -88,7 +88,7 @@ def listing(
     order = xp.argsort(~listed.ravel(), stable=True)[:max_events]
     rows = order // (1 + F)
     run = found._replace(
-        **{name: getattr(found, name)[rows] for name in RECORD} | {"event_index": indices.ravel()[order]},
+        **{name: getattr(found, name)[rows] for name in RECORD_FIELDS} | {"event_index": indices.ravel()[order]},
         count=xp.minimum(xp.sum(listed), max_events),
         unresolved=found.unresolved[:own],
         undefined=found.undefined[:own],

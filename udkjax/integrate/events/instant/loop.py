@@ -11,25 +11,25 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from udkjax.integrate.events.instant.hops import ends_hop, return_to_top
-from udkjax.integrate.events.instant.impacts import CLOSED, OPEN
+from udkjax.integrate.events.instant.impacts import CLOSED_TOL, OPEN
 from udkjax.integrate.events.instant.jumps import apply_event
-from udkjax.integrate.events.instant.runs import AGAIN, BEGIN, RECORD, MemberIndices, MemberRuns, RunState, take
+from udkjax.integrate.events.instant.runs import AFTER_EVENT, AT_START, RECORD_FIELDS, MemberIndices, MemberRuns, RunState, take
 from udkjax.integrate.events.instant.sticking import begin_with_friction
 from udkjax.integrate.events.instant.system import StateValues, System, condition_values
 from udkjax.integrate.events.law.crossings import (
     NO_EVENT,
-    ZERO,
-    ZERO_RATE,
+    ZERO_RATE_TOL,
+    ZERO_TOL,
     ConditionValues,
     crosses,
     first_crossing,
     side_of_zero,
 )
-from udkjax.integrate.events.law.kinks import FREE, MOST_KINKS
+from udkjax.integrate.events.law.kinks import FREE_SIDE, MOST_KINKS
 from udkjax.integrate.solution import Result
 from udkjax.native.watching.conditions import RESOLUTION
 
-CLOSED_FIELD, INDEX_FIELD = RECORD.index("closed"), RECORD.index("event_index")
+CLOSED_FIELD, INDEX_FIELD = RECORD_FIELDS.index("closed"), RECORD_FIELDS.index("event_index")
 
 
 def run_loop(system: System, runs: MemberRuns) -> MemberRuns:
@@ -51,7 +51,7 @@ def begin(system: System, runs: MemberRuns) -> MemberRuns:
 
 
 def settle(system: System, runs: MemberRuns) -> MemberRuns:
-    """Return the runs after the next event at their present times, if any; `event` is AGAIN where another may follow at once."""
+    """Return the runs after the next event at their present times, if any; `event` is AFTER_EVENT if another may follow."""
     if system.plan.held_at_rest.sum() > 1:
         runs = system.when(ends_hop(system, runs), partial(return_to_top, system), runs)
     return system.when(runs.running, partial(_settle, system), runs)
@@ -64,7 +64,7 @@ def _settle(system: System, runs: MemberRuns, members: MemberIndices) -> MemberR
     values, state_values = condition_values(system, members, state)
     values = values._replace(scale=xp.maximum(values.scale, take(runs.scale, members)))  # scales never decrease
     size, is_current = xp.abs(values.h), np.arange(E) == event[:, None]
-    carried = _carried(system, members, take(runs.carried, members) & (size <= CLOSED * values.scale), state.joints)
+    carried = _carried(system, members, take(runs.carried, members) & (size <= CLOSED_TOL * values.scale), state.joints)
     undefined, ends = ~xp.isfinite(values.h), state.t >= take(system.end, members)
     # A located condition keeps its side until its event happens, and so does one that has crossed zero just before a located one:
     # it is located next, unless it has just had its event, and is late by the error of the event's time. Any other nonzero
@@ -74,20 +74,20 @@ def _settle(system: System, runs: MemberRuns, members: MemberIndices) -> MemberR
     has_crossed = crosses(plan.both_directions[:E], sides[:, :E], sign)
     keeps = watched & (has_crossed | is_late) & (event >= 0)[:, None]
     # The side of a joint's speed is that of its direction, until its event: it is zero below a larger bound (`zero_of`).
-    known = (event >= NO_EVENT)[:, None] & ~is_current & (size > ZERO * values.scale) & ~keeps & ~plan.slides
+    known = (event >= NO_EVENT)[:, None] & ~is_current & (size > ZERO_TOL * values.scale) & ~keeps & ~plan.slides
     after = xp.where(known, sign, sides[:, :E])
     code = xp.where(take(runs.totals, members)[:, 0] >= plan.max_steps, Result.step_limit, Result.successful)
     unknown = (event < NO_EVENT) | ((event == NO_EVENT) & ends)  # otherwise conditions at zero will be located as they cross
     hits = (event >= 0) & (event < E) & xp.asarray(plan.impacts & ~plan.impacts.all())[event % E]
     if xp is not np or (unknown | hits).any():
-        begins, falling = event == BEGIN, plan.impacts | plan.kinks | plan.slides
-        is_zero, now = size <= ZERO * values.scale, side_of_zero(values, take(system.rate, members), xp)
+        begins, falling = event == AT_START, plan.impacts | plan.kinks | plan.slides
+        is_zero, now = size <= ZERO_TOL * values.scale, side_of_zero(values, take(system.rate, members), xp)
         # Contacts are approached from the allowed side: an impact whose condition is zero at the start and falls happens at once.
         before = xp.where(begins[:, None], xp.where(falling & is_zero, 1, now), sides[:, :E])
         now = xp.where(
             plan.slides & ~begins[:, None] & ~is_zero, before, now
         )  # a reversal at a speed that counts as zero is none
-        watched = watched & ~((event == AGAIN)[:, None] & _settled(system, runs, members))
+        watched = watched & ~((event == AFTER_EVENT)[:, None] & _settled(system, runs, members))
         crossing = first_crossing(plan.both_directions[:E], watched, before, now, xp)
         # A condition that an impact turns back at zero has reached zero before: its event comes first.
         others = first_crossing(plan.both_directions[:E], watched & is_zero & ~plan.impacts, before, now, xp)
@@ -137,7 +137,7 @@ def _jump(
     plan, xp, E, K = system.plan, system.xp, system.plan.count, system.plan.room
     k, before = take(runs.event, members), runs.state(members)
     sides, carried = take(runs.sides, members), take(runs.carried, members)
-    was_free = system.sides(members, before.joints) == FREE
+    was_free = system.sides(members, before.joints) == FREE_SIDE
     releases, e = k >= E, k % E
     held, acts = plan.held(before.phase, xp), releases | xp.asarray(plan.changes)[e]
     after, contacts, result = apply_event(system, members, k, before, values, state_values)
@@ -159,7 +159,7 @@ def _jump(
         noted = xp.concatenate([first, xp.zeros_like(first) + np.arange(3 * E)], axis=1)
         carried = xp.where(closed > OPEN, contacts.carried, carried)
         code = xp.where(xp.any(contacts.ends, -1), Result.at_rest, code)
-        turned_back = ~plan.impacts & (xp.abs(values.h) <= ZERO * values.scale) & xp.any(closed > OPEN, -1)[:, None]
+        turned_back = ~plan.impacts & (xp.abs(values.h) <= ZERO_TOL * values.scale) & xp.any(closed > OPEN, -1)[:, None]
         is_closed = xp.concatenate([closed, closed], axis=1) > OPEN
         sides = xp.where(is_closed, 1, xp.where(xp.concatenate([turned_back, xp.zeros_like(turned_back)], axis=1), 0, sides))
     blocked = result != Result.successful
@@ -175,7 +175,7 @@ def _jump(
     is_full = (count - kinks + total > plan.max_events) & ~is_kink
     # So many kinks are a force that chatters: its comparisons are not held any more, also after later events.
     chatters = (is_kink & (kinks + 1 >= MOST_KINKS))[:, None]
-    turned = xp.where((chatters | was_free) & (np.arange(plan.side_count) >= plan.first_kink_side), FREE, turned)
+    turned = xp.where((chatters | was_free) & (np.arange(plan.side_count) >= plan.first_kink_side), FREE_SIDE, turned)
     after = after._replace(joints=system.with_sides(members, after.joints, turned))
     carried = _carried(system, members, carried, after.joints)
     code = xp.where(is_full, Result.event_limit, code)
@@ -202,7 +202,7 @@ def _jump(
         q=q,
         v=v,
         phase=xp.where(stays, before.phase, after.phase),
-        event=xp.where(follows, AGAIN, NO_EVENT),
+        event=xp.where(follows, AFTER_EVENT, NO_EVENT),
         sides=sides,
         carried=carried,
         count=count + xp.where(is_full, 0, total),
@@ -217,7 +217,7 @@ def _stands(
     """Return a mask of the members in which a joint that event e adds stops its condition, which then stays at zero."""
     xp, own = system.xp, np.arange(system.plan.count) == e[:, None]
     rate = found.by_t + xp.sum(found.by_q * after.v[:, None], axis=-1)
-    slow = xp.abs(rate) <= ZERO_RATE * values.scale * take(system.rate, members)[:, None]
+    slow = xp.abs(rate) <= ZERO_RATE_TOL * values.scale * take(system.rate, members)[:, None]
     counts = system.plan.adds & ~system.plan.follows_velocity
     return xp.any(own & slow & counts, axis=-1)
 
@@ -242,5 +242,5 @@ def _may_follow(
     of contacts at the event (OPEN, TOUCHES, SLOW); `settled` marks an event that changes nothing. Joints with set-valued friction
     are left out: a single decision covers every joint at rest.
     """
-    unclear = watched & ~settled & (closed == OPEN) & (system.xp.abs(values.h) <= ZERO * values.scale)
+    unclear = watched & ~settled & (closed == OPEN) & (system.xp.abs(values.h) <= ZERO_TOL * values.scale)
     return system.xp.any((unclear | system.plan.follows_velocity) & ~system.plan.slides, axis=-1)

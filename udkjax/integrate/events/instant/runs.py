@@ -16,7 +16,7 @@ from udkjax.integrate.events.law.event_plan import EventPlan
 from udkjax.integrate.solution import Result
 
 # Used instead of the index of an event: conditions are not evaluated yet, at the start of the run or after an event.
-BEGIN, AGAIN = -3, -2
+AT_START, AFTER_EVENT = -3, -2
 
 MemberIndices = Int[np.ndarray, "b"] | None  # the indices of members; None: all members
 
@@ -64,7 +64,7 @@ class EventRun(NamedTuple):
 
 
 EVENT_STATES = ("event_time", "event_q", "event_v")
-RECORD = (
+RECORD_FIELDS = (
     *EVENT_STATES,
     "event_index",
     "event_phase",
@@ -89,7 +89,7 @@ class MemberRuns(NamedTuple):
     v: Float[Any, "B n"]
     phase: Bool[Any, "B C"]
     joints: Any
-    event: Int[Any, "B"]  # index of the event at this time, plus E if a contact opens; or `NO_EVENT`, `BEGIN`, `AGAIN`
+    event: Int[Any, "B"]  # index of the event at this time, plus E if a contact opens; or `NO_EVENT`, `AT_START`, `AFTER_EVENT`
     sides: Int[Any, "B 2E"]  # the last side of zero of each condition and contact force: -1 or 1; 0 if unknown
     scale: Float[Any, "B E"]  # scales of conditions, as in `ConditionValues`
     carried: Bool[Any, "B E"]  # the contacts kept at zero by other contacts at rest
@@ -100,7 +100,7 @@ class MemberRuns(NamedTuple):
     qs: Float[Any, "B T n"]
     vs: Float[Any, "B T n"]
     count: Int[Any, "B"]  # number of events
-    record: tuple[Any, ...]  # fields `RECORD` of `EventRun`, with one more row as a sink for entries without an event
+    record: tuple[Any, ...]  # fields `RECORD_FIELDS` of `EventRun`, with one more row as a sink for entries without an event
     window: Any  # `Window` of the plain form; else None
     first_phase: Bool[Any, "B C"]  # phase at the start
     first_sides: Float[Any, "B S"]  # sides at the start
@@ -113,7 +113,7 @@ class MemberRuns(NamedTuple):
 
     def kink_count(self, plan: EventPlan, members: MemberIndices) -> Int[Any, "b"]:
         """Return the number of kinks that members have recorded so far."""
-        index = take(self.record[RECORD.index("event_index")], members)
+        index = take(self.record[RECORD_FIELDS.index("event_index")], members)
         xp = np if isinstance(index, np.ndarray) else jnp
         if not plan.has_kinks:
             return xp.zeros(len(index), int)
@@ -128,7 +128,7 @@ class MemberRuns(NamedTuple):
         return self
 
     def note(self, members: MemberIndices, rows: Int[Any, "b k"], *new: Any) -> "MemberRuns":
-        """Return the runs with new entries in `rows` of the record: an array (b or 1, k or 1, ...) for each field of `RECORD`."""
+        """Return the runs with new entries in `rows` of the record: an array (b or 1, k or 1, ...) for each field of a record."""
         column = (np.arange(len(self.t)) if members is None else members)[:, None]
         if isinstance(self.t, np.ndarray):
             for array, x in zip(self.record, new, strict=True):
@@ -159,7 +159,7 @@ def runs_before(plan: EventPlan, state: RunState, T: int, code: Int[Any, "B"], x
     no = xp.zeros((B, E), bool)
     return MemberRuns(
         *state,
-        event=xp.full(B, BEGIN),
+        event=xp.full(B, AT_START),
         sides=xp.zeros((B, 2 * E), int),
         scale=xp.zeros((B, E)),
         carried=no,

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Int
 from udkjax.complementarity.stick_or_slip import AT_REST, ContactsAtRest, FrictionModes, JointsAtRest, Response
 from udkjax.integrate.events.instant.runs import MemberIndices, MemberRuns, RunState, take
 from udkjax.integrate.events.instant.system import System, condition_values
-from udkjax.integrate.events.law.crossings import ZERO_RATE_2
+from udkjax.integrate.events.law.crossings import ZERO_RATE_2_TOL
 from udkjax.integrate.solution import Result
 from udkjax.transforms.gradients import stop_gradients
 
@@ -136,7 +136,7 @@ def _decide(
     scale, speed = values.scale[..., forwards], values.h[..., forwards]
     is_stopped, leaves = ([stopped[..., None] == start + forwards + k for k in (0, 1)] for start in (0, E))
     rest = is_stopped[0] | is_stopped[1] | (xp.abs(speed) <= AT_REST.closed * scale)
-    unit, most = ZERO_RATE_2 * values.scale * rate**2, int(plan.impacts.sum()) if plan.has_rubbing_contacts else 0
+    unit, most = ZERO_RATE_2_TOL * values.scale * rate**2, int(plan.impacts.sum()) if plan.has_rubbing_contacts else 0
     contacts = ContactsAtRest(plan.contacts_that_rub, before.held, may_change, unit, most)
     if xp is np and not rest.any() and not may_change.any():
         modes = FrictionModes(rest, xp.sign(speed) * contacts.active(before.held), rest, rest, before.held)

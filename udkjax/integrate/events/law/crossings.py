@@ -10,12 +10,12 @@ from jaxtyping import Array, Bool, Float, Int
 
 # Bounds below which a condition, its first rate (per T) and its second rate (per T^2) are zero, relative to the condition's
 # scale: its change by a displacement of L or a turn of one radian. Rounding errors of a state are about 1e-15.
-ZERO, ZERO_RATE, ZERO_RATE_2 = 1e-12, 1e-12, 1e-10
+ZERO_TOL, ZERO_RATE_TOL, ZERO_RATE_2_TOL = 1e-12, 1e-12, 1e-10
 # Speeds of joints that stick or slip, in absolute tolerances: smaller ones are no reversals. Steps leave errors of their
 # tolerance in the speed of a joint that hardly moves, and the polynomials between steps at the limit of stability several times
 # as much.
-SLOW = 10.0
-PARTS, DIVISIONS = 32, 6  # the bracket of a cubic's root is divided into 32 parts 6 times: to 1e-9 of its length
+REVERSAL_SPEED = 10.0
+BRACKET_PARTS, BRACKET_DIVISIONS = 32, 6  # the bracket of a cubic's root is divided into 32 parts 6 times: to 1e-9 of its length
 NO_EVENT = -1
 
 Cubic = tuple[Array, Array, Array, Array]  # value and slope at 0, value and slope at 1
@@ -39,7 +39,7 @@ def zero_of(slides: Bool[np.ndarray, "E"], atol: Float[Any, "*b 1"], xp: ModuleT
         atol: absolute tolerance of each member, in units of the scene.
         xp: jax.numpy, or NumPy.
     """
-    return xp.where(slides, xp.maximum(SLOW * atol, ZERO), ZERO)
+    return xp.where(slides, xp.maximum(REVERSAL_SPEED * atol, ZERO_TOL), ZERO_TOL)
 
 
 def side_of_zero(values: ConditionValues, rate: Float[Any, "*m"], xp: ModuleType = jnp) -> Int[Any, "*m C"]:
@@ -52,9 +52,9 @@ def side_of_zero(values: ConditionValues, rate: Float[Any, "*m"], xp: ModuleType
     """
     h, dh, ddh, _, scale = values
     unit = scale * rate[..., None]
-    by_second_rate = xp.where(xp.abs(ddh) > ZERO_RATE_2 * unit * rate[..., None], xp.sign(ddh), 0.0)
-    by_rate = xp.where(xp.abs(dh) > ZERO_RATE * unit, xp.sign(dh), by_second_rate)
-    return xp.where(xp.abs(h) > ZERO * scale, xp.sign(h), by_rate).astype(int)
+    by_second_rate = xp.where(xp.abs(ddh) > ZERO_RATE_2_TOL * unit * rate[..., None], xp.sign(ddh), 0.0)
+    by_rate = xp.where(xp.abs(dh) > ZERO_RATE_TOL * unit, xp.sign(dh), by_second_rate)
+    return xp.where(xp.abs(h) > ZERO_TOL * scale, xp.sign(h), by_rate).astype(int)
 
 
 def first_crossing(
@@ -103,9 +103,9 @@ def cubic_slope(cubic: Cubic, x: Array) -> Array:
 
 def cubic_root(cubic: Cubic, side: Any, xp: ModuleType = jnp) -> Any:
     """Return the zero in [0, 1] of Hermite's cubic that is on `side` (-1 or 1) of zero at 0, and on the other side at 1."""
-    low, width, places = xp.zeros_like(cubic[0]), 1.0, np.arange(1, PARTS)
-    for _ in range(DIVISIONS):
-        width /= PARTS
+    low, width, places = xp.zeros_like(cubic[0]), 1.0, np.arange(1, BRACKET_PARTS)
+    for _ in range(BRACKET_DIVISIONS):
+        width /= BRACKET_PARTS
         x = low + width * places.reshape(-1, *[1] * low.ndim)
         low = low + width * xp.sum(cubic_value(cubic, x) * side > 0, axis=0)
     middle = low + width / 2

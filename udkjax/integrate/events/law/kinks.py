@@ -27,7 +27,7 @@ from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.tables.element_setup import attached_bodies
 from udkjax.wording import quote
 
-FREE = np.inf  # a side that is not held
+FREE_SIDE = np.inf  # a side that is not held
 MOST_KINKS = 256  # of a run; then sides are no longer held, as a run at rest where a force jumps would make no progress
 
 
@@ -186,7 +186,7 @@ def _with_held_loads(system: Any) -> tuple[Any, tuple[HeldElement, ...], tuple[E
     smooth = SmoothLoads.of_functions(system.functions, system.breakpoints is not None)
     if not smooth.count:
         return system, (), ()
-    sides = jnp.full(smooth.count, FREE)
+    sides = jnp.full(smooth.count, FREE_SIDE)
     found = HeldElement(None, smooth, tuple(range(system.functions.n)), 0, 0)
     return (
         system.with_functions(smooth.held(system.functions), sides),
@@ -211,7 +211,7 @@ def _with_held_elements(mechanism: Mechanism, first: int) -> tuple[Mechanism, tu
         frames = attached_bodies(element, mechanism.joints)
         assert smooth.kind is not None  # loads of an element
         nameless = jax.tree.unflatten(smooth.kind.tree, jax.tree.leaves(element))
-        sides = jnp.full(smooth.count, FREE)
+        sides = jnp.full(smooth.count, FREE_SIDE)
         forces[k] = HeldForce(bodies=tuple(frames), element=nameless, sides=sides, smooth=smooth)
         bodies = (mechanism.body_names.index(b) for b in frames if b != GROUND)
         elements.append(HeldElement(k, smooth, tuple(3 * b + i for b in bodies for i in range(3)), first, len(events)))
@@ -234,7 +234,7 @@ def has_sides(model: Any, force: int | None) -> bool:
 
 
 def renewed_sides(elements: Sequence[HeldElement], model: Any, t: Any, q: Any, v: Any, sides: Any) -> Array:
-    """Return all sides at a state; sides of kinks that are unknown (FREE), or depend on others, are determined from the state."""
+    """Return all sides at a state; unknown sides (FREE_SIDE), and those that depend on others, are determined from the state."""
     if not elements:
         return sides
     result = list(sides[: elements[0].first])

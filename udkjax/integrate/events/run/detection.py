@@ -15,17 +15,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from udkjax.integrate.events.law.crossings import ZERO, Cubic, carry_signs, crosses, cubic_root, cubic_slope, cubic_value
+from udkjax.integrate.events.law.crossings import ZERO_TOL, Cubic, carry_signs, crosses, cubic_root, cubic_slope, cubic_value
 from udkjax.native.watching.conditions import RESOLUTION
 
-INTERVALS = 32  # number of intervals of a window
+WINDOW_INTERVALS = 32  # number of intervals of a window
 # The nodes, relative to a window's length: slightly irregular, so that no oscillation is zero at all of them.
-_shift = 0.2 * np.sin(np.arange(INTERVALS + 1) * 2.4)
+_shift = 0.2 * np.sin(np.arange(WINDOW_INTERVALS + 1) * 2.4)
 _shift[[0, -1]] = 0.0
-NODES = (np.arange(INTERVALS + 1) + _shift) / INTERVALS
+NODES = (np.arange(WINDOW_INTERVALS + 1) + _shift) / WINDOW_INTERVALS
 INTERVALS_OF_JUMP = 6  # a jump or a kink makes at most this many intervals coarse, at every scale
 
-REDONE = 4  # intervals before a coarse one that are repeated
+REPEATED_INTERVALS = 4  # intervals before a coarse one that are repeated
 
 
 class _Arithmetic(NamedTuple):
@@ -116,7 +116,7 @@ def detect(
 
     is_crossing = hits & crosses(direction, before, after) & usable
     place, coarse_place = (xp.argmax(xp.any(x, axis=1)) for x in (is_crossing, coarse))
-    last_sure = xp.maximum(coarse_place - REDONE, 0)  # earlier intervals may only look fine enough
+    last_sure = xp.maximum(coarse_place - REPEATED_INTERVALS, 0)  # earlier intervals may only look fine enough
     at_place: Cubic = (cubic[0][place], cubic[1][place], cubic[2][place], cubic[3][place])
     root = xp.where(is_crossing[place], cubic_root(at_place, before[place], xp), xp.inf)
     event, is_found = xp.argmin(root), xp.any(is_crossing)
@@ -130,7 +130,7 @@ def detect(
         is_found=is_found & ~is_coarse,
         event=event,
         root=root[event],
-        is_exact=(single & (error <= ZERO / 10 * scale))[place, event] & (place == last_before),
+        is_exact=(single & (error <= ZERO_TOL / 10 * scale))[place, event] & (place == last_before),
         is_coarse=is_coarse,
         last_sure=last_sure,
         coarse=coarse[coarse_place],

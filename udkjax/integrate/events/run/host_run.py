@@ -20,7 +20,7 @@ from udkjax.integrate.events.instant.runs import EventRun, RunState, results, ru
 from udkjax.integrate.events.law.actions import numbers_of_actions
 from udkjax.integrate.events.law.event import Event
 from udkjax.integrate.events.law.event_plan import EventPlan, event_plan
-from udkjax.integrate.events.law.kinks import FREE, places_of_kinks
+from udkjax.integrate.events.law.kinks import FREE_SIDE, places_of_kinks
 from udkjax.integrate.events.law.phases import SCENE, Phases
 from udkjax.integrate.events.run.added_joints import added_joints, joint_numbers
 from udkjax.integrate.events.run.condition_program import condition_numbers, with_forces
@@ -36,7 +36,7 @@ from udkjax.programs.numpy_program import Meter, numpy_program
 from udkjax.transforms.gradients import stop_gradients
 from udkjax.wording import quote
 
-SHARED, NUMBERS = 9, 5  # number of arrays before those of the phases, and index of the numbers of conditions
+SHARED_ARRAYS, NUMBERS_INDEX = 9, 5  # number of arrays before those of the phases, and index of the numbers of conditions
 
 
 @dataclass(frozen=True)
@@ -121,12 +121,12 @@ class HostRun:
 
     def __call__(self, *inputs: np.ndarray) -> list[np.ndarray]:
         B, plan = max(len(x) for x in inputs), self.plan
-        numbers, further, phases = inputs[NUMBERS], list(inputs[SHARED:]), []
+        numbers, further, phases = inputs[NUMBERS_INDEX], list(inputs[SHARED_ARRAYS:]), []
         widths = [*(len(joint.program.outputs) for joint in plan.added), plan.events.side_count]
         of_joints = np.full((B, sum(widths)), np.nan)  # of joints that events add, then all sides
         joints = np.split(of_joints, np.cumsum(widths)[:-1], axis=1)  # views
-        joints[-1][:] = FREE
-        shared = (np.broadcast_to(x, (B, *x.shape[1:])) for x in inputs[:SHARED])
+        joints[-1][:] = FREE_SIDE
+        shared = (np.broadcast_to(x, (B, *x.shape[1:])) for x in inputs[:SHARED_ARRAYS])
         ts, q, v, code, units, _, of_actions, inverse_mass, joint_numbers = shared
         for phase in plan.phases:
             phases.append(

@@ -15,9 +15,9 @@ from jaxtyping import Bool, Float, Int
 from udkjax.integrate.events.instant.impacts import OPEN
 from udkjax.integrate.events.instant.runs import Change, MemberIndices, MemberRuns, RunState, take
 from udkjax.integrate.events.instant.system import StateValues
-from udkjax.integrate.events.law.crossings import NO_EVENT, ZERO, zero_of
+from udkjax.integrate.events.law.crossings import NO_EVENT, ZERO_TOL, zero_of
 from udkjax.integrate.events.law.event_plan import EventPlan
-from udkjax.integrate.events.law.kinks import FREE, MOST_KINKS, HeldElement
+from udkjax.integrate.events.law.kinks import FREE_SIDE, MOST_KINKS, HeldElement
 from udkjax.integrate.events.law.phases import SCENE, SWITCHED
 from udkjax.integrate.events.run.added_joints import AddedJoint, evaluate_joint
 from udkjax.integrate.events.run.machine_windows import MachineMotion
@@ -30,10 +30,11 @@ from udkjax.native.module.steps import Status
 from udkjax.native.runs import RunStates
 
 STATUS, TIME, COUNTS, WRITTEN, IMPLICIT = 0, 1, slice(2, 5), 5, 7  # of `RunStates.info_names`
-INFO = len(RunStates.info_names)
-# Where forces vary too quickly, tolerances are tightened by factors of `TIGHTER`, at last to `TIGHTEST`, where errors of steps
-# are rounding errors. A thousandth leaves two tries at most at usual tolerances; each costs the steps of a start alone.
-TIGHTER, TIGHTEST = 1e-3, 1e-12
+INFO_LENGTH = len(RunStates.info_names)
+# Where forces vary too quickly, tolerances are multiplied by TIGHTENING_FACTOR, once or several times, but not below
+# TIGHTEST_TOL, where errors of steps are rounding errors. With a thousandth there are at most two tries at usual tolerances, and
+# each costs only the steps of a start.
+TIGHTENING_FACTOR, TIGHTEST_TOL = 1e-3, 1e-12
 
 
 class MachinePlan(NamedTuple):
@@ -160,7 +161,7 @@ class MachineSystem:
 
     def first_sides(self, at: RunState) -> Float[np.ndarray, "B S"]:
         """Return all sides of all members at the start (B, S)."""
-        unknown = np.full_like(at.joints[-1], FREE)
+        unknown = np.full_like(at.joints[-1], FREE_SIDE)
         unknown[:, : self.plan.first_kink_side] = 0.0
         return self._renew(None, at, unknown)
 
@@ -269,8 +270,8 @@ class MachineSystem:
             span = stretch.t[b] - last[:, TIME]
             share = np.where(span > 0, (times[b, k + 1] - stretch.t[b]) / np.where(span > 0, span, 1.0), 0.0)[:, None]
             places = members[b], output[b, k]
-            runs.qs[places] = stretch.q_end[b] + share * (stretch.q_end[b] - last[:, INFO : INFO + n])
-            runs.vs[places] = stretch.v_end[b] + share * (stretch.v_end[b] - last[:, INFO + n :])
+            runs.qs[places] = stretch.q_end[b] + share * (stretch.q_end[b] - last[:, INFO_LENGTH : INFO_LENGTH + n])
+            runs.vs[places] = stretch.v_end[b] + share * (stretch.v_end[b] - last[:, INFO_LENGTH + n :])
         runs.totals[members, :3] += counts
         runs.totals[members, 4] += stretch.info[:, IMPLICIT].astype(int)
         if self._is_projected[which]:
@@ -323,7 +324,7 @@ class MachineSystem:
         """
         holds = self.plan.watched(runs.phase[members], runs.carried[members], np)[:, self.plan.count :].any(axis=1)
         before = self._tightened[members]
-        tighter = np.maximum(TIGHTER * before, TIGHTEST / self._phases[which].tolerances(members))
+        tighter = np.maximum(TIGHTENING_FACTOR * before, TIGHTEST_TOL / self._phases[which].tolerances(members))
         helps = holds & (tighter < before)
         self._tightened[members[helps]] = tighter[helps]
         return helps
@@ -350,13 +351,17 @@ class MachineSystem:
             of_kinks = runs.joints[-1][:, self.plan.first_kink_side :]
             chatters = unresolved & np.isfinite(of_kinks[members]).all(1)
             freed, unresolved = members[chatters], unresolved & ~chatters
-            of_kinks[freed], self.lost_kinks[freed], runs.running[freed] = FREE, runs.t[freed], True
+            of_kinks[freed], self.lost_kinks[freed], runs.running[freed] = FREE_SIDE, runs.t[freed], True
             fails = fails & ~chatters
         self.go_on_by_windows(members[unresolved], stretch.t[unresolved])
         runs.running[members[unresolved]] = True
         fails = fails & ~unresolved
         code = np.where(drifts, Result.drift, failure(status, np))
-        last = stretch.info[fails, TIME], stretch.info[fails, INFO : INFO + n], stretch.info[fails, INFO + n :]
+        last = (
+            stretch.info[fails, TIME],
+            stretch.info[fails, INFO_LENGTH : INFO_LENGTH + n],
+            stretch.info[fails, INFO_LENGTH + n :],
+        )
         runs.code[members[fails]] = code[fails]
         runs.t[members[fails]], runs.q[members[fails]], runs.v[members[fails]] = last
 
@@ -381,7 +386,7 @@ class MachineSystem:
         """Return the array of `_watch` before a run, with the entries that stay constant."""
         units, B = self._units, len(self.end)
         room, ones = plan.number_count + 2 * len(watched), np.ones((B, 1))
-        force = ZERO * units.mass * units.length * units.rate**2
+        force = ZERO_TOL * units.mass * units.length * units.rate**2
         constants = force[:, None] * np.ones(len(watched)), self.plan.both_directions[watched] * ones, units.scene_rate[:, None]
         of_passing = []
         if plan.run.passing is not None:  # the locks of joints that stick are the last of the joints that events add

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 
 from udkjax.complementarity.stick_or_slip import AT_REST, BLOCK_STEPS, SINGLE_STEPS
 from udkjax.expressions import ScalarProgram
-from udkjax.integrate.events.law.crossings import SLOW, ZERO
+from udkjax.integrate.events.law.crossings import REVERSAL_SPEED, ZERO_TOL
 from udkjax.integrate.events.law.event_plan import EventPlan
 from udkjax.integrate.events.law.kinks import KinkPlaces
 from udkjax.integrate.events.law.phases import Phases
@@ -51,7 +51,7 @@ def passed_events(
         "slides": slides,
         "sides": plan.side_count,
         "of_scene": tuple(of_scene),
-        "zero": ZERO,
+        "zero": ZERO_TOL,
     }
 
 
@@ -85,7 +85,7 @@ def _slides(plan: EventPlan, conditions: Conditions, added: Sequence[AddedJoint]
         "first_force": first_force,
         "locks": tuple(locks),
         "closed": AT_REST.closed,
-        "slow": SLOW,
+        "slow": REVERSAL_SPEED,
         "still": AT_REST.still,
         "block_steps": BLOCK_STEPS,
         "single_steps": SINGLE_STEPS,

@@ -26,10 +26,10 @@ from udkjax.native.operations import EvaluateEvents, MarkRows, StateOperation
 from udkjax.native.runs import RunWatched
 from udkjax.native.watching.conditions import Conditions
 
-INPUTS = RunWatched.input_names
-STATE = slice(INPUTS.index("ts"), INPUTS.index("v") + 1)  # the inputs of a run that are times and initial state
-PARTS = ("numbers", "settings", "rows", "breaks", "rank_tol")  # arrays of a phase, followed by its samples if it has any
-ALL = np.ones(1, bool)  # of one member
+INPUT_NAMES = RunWatched.input_names
+STATE_INPUTS = slice(INPUT_NAMES.index("ts"), INPUT_NAMES.index("v") + 1)  # the inputs of a run that are times and initial state
+PHASE_ARRAYS = ("numbers", "settings", "rows", "breaks", "rank_tol")  # arrays of a phase, followed by its samples if it has any
+ONE_MEMBER_MASK = np.ones(1, bool)  # of one member
 
 
 class ValuesLayout:
@@ -102,7 +102,7 @@ class PhasePlan(NamedTuple):
     @property
     def count(self) -> int:
         """The number of arrays of `phase_arrays`."""
-        return len(PARTS) + bool(self.run.sampled)
+        return len(PHASE_ARRAYS) + bool(self.run.sampled)
 
 
 def phase_plan(
@@ -155,16 +155,16 @@ def _marking(textbook: Any) -> MarkRows:
 
 
 def phase_arrays(problem: Problem, plan: PhasePlan, xp: ModuleType = jnp) -> list[Any]:
-    """Return the arrays of the phases of one mechanism, each with a leading axis for its one member: `PARTS`, then samples."""
+    """Return the arrays of the phases of one mechanism, each with a leading axis of length one: `PHASE_ARRAYS`, then samples."""
     if plan.marking is not None:
         problem = replace(problem, marks=np.ones(plan.run.code.row_count))
     inputs = run_inputs(problem, plan.run, xp)
     tol = problem.textbook.scales.rank_tol**2 if plan.marking is not None else 0.0
     return [
-        *inputs[: STATE.start],
-        *inputs[STATE.stop : len(INPUTS)],
+        *inputs[: STATE_INPUTS.start],
+        *inputs[STATE_INPUTS.stop : len(INPUT_NAMES)],
         xp.reshape(xp.asarray(tol, float), (1, 1)),
-        *inputs[len(INPUTS) :],
+        *inputs[len(INPUT_NAMES) :],
     ]
 
 
@@ -343,7 +343,7 @@ class PhaseCode:
             return numbers
         is_one = len(members) == 1
         for phase in state.phase if is_one else np.unique(state.phase, axis=0):
-            marks, here = self._marks.get(phase.tobytes()), ALL if is_one else (state.phase == phase).all(axis=1)
+            marks, here = self._marks.get(phase.tobytes()), ONE_MEMBER_MASK if is_one else (state.phase == phase).all(axis=1)
             if marks is None:
                 marks = self._marks[phase.tobytes()] = self._no_marks.copy()
             unknown = here & np.isnan(marks[members, 0])  # all marks of a member become known together

@@ -16,7 +16,7 @@ from udkjax.integrate.events.instant.jumps import apply_event
 from udkjax.integrate.events.instant.runs import EventRun, RunState
 from udkjax.integrate.events.instant.sticking import modes_of, settle_friction
 from udkjax.integrate.events.instant.system import condition_values
-from udkjax.integrate.events.law.crossings import NO_EVENT, ZERO, ZERO_RATE, ZERO_RATE_2
+from udkjax.integrate.events.law.crossings import NO_EVENT, ZERO_RATE_2_TOL, ZERO_RATE_TOL, ZERO_TOL
 from udkjax.integrate.events.law.event_plan import EventPlan
 from udkjax.integrate.events.run.host_run import run_by_machine_code
 from udkjax.integrate.events.run.hybrid import Hybrid, rate_along
@@ -29,7 +29,7 @@ from udkjax.programs.undefined import defined_along
 from udkjax.transforms.gradients import stop_gradients
 from udkjax.transforms.traced_numbers import replaced, select
 
-OUTPUTS = 32  # per piece
+OUTPUTS_PER_PIECE = 32  # per piece
 
 
 def run_events(hybrid: Hybrid, conditions: Conditions | None) -> EventRun:
@@ -196,7 +196,7 @@ def replay(hybrid: Hybrid, found: EventRun, zero: Float[Array, ""]) -> tuple[Arr
     hybrid = replace(hybrid, replays=True)
     system = PlainSystem(hybrid)
     ts, T, K, n = stop_gradients(hybrid.ts), len(hybrid.ts), len(found.event_time), len(hybrid.q)
-    width = min(OUTPUTS, T)
+    width = min(OUTPUTS_PER_PIECE, T)
     pieces = K + -(-T // (width - 1)) + 2
 
     def piece(start: PieceStart, _: None) -> tuple[PieceStart, PieceOutput]:
@@ -301,14 +301,14 @@ def _apply_at_fixed_time(
         of_force = hybrid.forces(state)[k % E], rate_along(force, *at[:3], a)[1]
         h, rate = (jnp.where(k >= E, *x) for x in zip(of_force, (h, rate), strict=True))
     unit = jnp.where(k >= E, hybrid.force, values.scale[0, k % E])
-    is_transversal = jnp.abs(stop_gradients(rate)) > ZERO_RATE * unit * hybrid.rate
+    is_transversal = jnp.abs(stop_gradients(rate)) > ZERO_RATE_TOL * unit * hybrid.rate
     if system.plan.held_at_rest.any():  # a contact comes to rest at the top of a hop, where its rate falls through zero (`hops`)
         of_top, rate_2 = hybrid.conditions_and_rates(state.joints)(*state[:3])[1][k % E], values.rate_2[0, k % E]
-        is_top = ~again & ~is_transversal & (index >= 2 * E) & (rate_2 < -ZERO_RATE_2 * unit * hybrid.rate**2)
+        is_top = ~again & ~is_transversal & (index >= 2 * E) & (rate_2 < -ZERO_RATE_2_TOL * unit * hybrid.rate**2)
         h, rate, is_transversal = jnp.where(is_top, of_top, h), jnp.where(is_top, rate_2, rate), is_transversal | is_top
     # An event at the same instant as the event before moves with that event if its condition is stationary, or if the jump of
     # the event before has carried its condition beyond zero, further than the flow does within the shortest step.
-    by_flow = ZERO * unit + 2 * hybrid.smallest * jnp.abs(rate)
+    by_flow = ZERO_TOL * unit + 2 * hybrid.smallest * jnp.abs(rate)
     is_transversal &= ~(again & (jnp.abs(stop_gradients(h)) > stop_gradients(by_flow)))
     h = h - stop_gradients(h)
     rate = jnp.where(is_transversal, rate, 1.0)

@@ -19,9 +19,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from udkjax.integrate.events.instant.runs import RunState
-from udkjax.integrate.events.law.crossings import NO_EVENT, ZERO, zero_of
+from udkjax.integrate.events.law.crossings import NO_EVENT, ZERO_TOL, zero_of
 from udkjax.integrate.events.law.event_plan import EventPlan
-from udkjax.integrate.events.run.detection import INTERVALS, NODES, Nodes, detect
+from udkjax.integrate.events.run.detection import NODES, WINDOW_INTERVALS, Nodes, detect
 from udkjax.integrate.outcome import failure
 from udkjax.integrate.problem import IntegratorOutput
 from udkjax.integrate.solution import Result
@@ -127,7 +127,7 @@ def advance_window(motion: WindowMotion, window: Window, state: RunState, given:
     output = xp.searchsorted(ts, t) + np.arange(min(MOST_OUTPUTS, T))
     requested = ts[xp.minimum(output, T - 1)]
     speed = xp.maximum(units.scene_rate, motion.size(state.v))
-    full = xp.where(speed > 0, INTERVALS / RESOLUTION.per_time / xp.where(speed > 0, speed, 1.0), ts[-1] - ts[0])
+    full = xp.where(speed > 0, WINDOW_INTERVALS / RESOLUTION.per_time / xp.where(speed > 0, speed, 1.0), ts[-1] - ts[0])
     zooms = window.event != NO_EVENT
     end = xp.where(zooms, window.high, t + xp.minimum(full, window.reach))
     end = xp.minimum(end, xp.minimum(requested[-1], ts[-1]))
@@ -155,7 +155,7 @@ def advance_window(motion: WindowMotion, window: Window, state: RunState, given:
         direction=plan.both_directions,
         sides=given.sides,
         scale=xp.append(given.scale, xp.zeros(E) + units.force),
-        zero=xp.append(zero_of(plan.slides, units.atol, xp), xp.full(E, ZERO)),
+        zero=xp.append(zero_of(plan.slides, units.atol, xp), xp.full(E, ZERO_TOL)),
         located=window.event,
         watched=given.watched & ~lands,
         is_short=length * units.rate <= RESOLUTION.short,
@@ -229,7 +229,7 @@ def _change_to_zero(
     """
     k = xp.clip(event, 0, len(g) - 1)
     has_rate = (event == k) & ~xp.asarray(plan.by_velocity)[k] & (rate[k] != 0)
-    side, is_zero = given.sides[k], xp.abs(g[k]) <= ZERO * given.scale[k]
+    side, is_zero = given.sides[k], xp.abs(g[k]) <= ZERO_TOL * given.scale[k]
     change = xp.where(has_rate & ~is_zero & (side != 0), -g[k] / xp.where(has_rate, rate[k], 1.0), 0.0)
     return change, g[k] * side > 0
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from udkjax.annotations import Numbers
 from udkjax.argument_types import NOT_NEGATIVE
-from udkjax.integrate.portable.c.scene import INFO, SceneCode, comment_text, string_text, table
+from udkjax.integrate.portable.c.scene import INFO_PLACES, SceneCode, comment_text, string_text, table
 from udkjax.integrate.solution import Result, versions
 from udkjax.native.c import CUnit
 from udkjax.native.runs import RunStates
@@ -21,7 +21,7 @@ from udkjax.scene.mechanism import Mechanism
 What = Literal[
     "run", "step_derivatives", "accelerations", "derivatives", "projection", "positions", "position_derivatives", "reactions"
 ]
-DOCUMENTED = {
+FUNCTION_COMMENTS = {
     "run": """/* Integrate, and project each step onto the constraints: positions qs and velocities vs (times, {N})
    at the times ts, which increase (s), from the closed state q, v; the largest violation of the constraints at each
    time, over the scales of their rows; and info, then the last q and v. Returns 0, or why the run ended ({p}_result_name).
@@ -64,12 +64,12 @@ void {p}_reactions(const double *numbers, double t, const double *q, const doubl
     double *memory);
 """,
 }
-ALONG = """/* Write changes of the numbers. `parameters` has the parameters, and then their changes. */
+PARAMETERS_ALONG_TEXT = """/* Write changes of the numbers. `parameters` has the parameters, and then their changes. */
 void {p}_set_parameters_along(const double *parameters, double *dnumbers);
 """
-MARK = "/* Written by udkjax; a further export replaces this file of the scene "
-DIFFERENTIATED = {"step_derivatives", "derivatives", "position_derivatives"}
-FUNCTIONS: dict[str, Callable[[SceneCode], tuple[str, CUnit]]] = {name: getattr(SceneCode, name) for name in DOCUMENTED}
+FILE_MARK = "/* Written by udkjax; a further export replaces this file of the scene "
+DIFFERENTIATED_UNITS = {"step_derivatives", "derivatives", "position_derivatives"}
+FUNCTIONS: dict[str, Callable[[SceneCode], tuple[str, CUnit]]] = {name: getattr(SceneCode, name) for name in FUNCTION_COMMENTS}
 
 
 class ExportedCode(NamedTuple):
@@ -140,7 +140,7 @@ def export_c(
     if "run" in units:
         found["main.c"] = _main(scene)
     to = Path(folder)
-    mark = f"{MARK}{scene.prefix}. */\n"
+    mark = f"{FILE_MARK}{scene.prefix}. */\n"
     _clear(to, found, mark)
     for name, text in found.items():
         (to / name).write_text(mark + text, encoding="ascii", errors="backslashreplace")
@@ -155,7 +155,7 @@ def _clear(folder: Path, names: Collection[str], mark: str) -> None:
     """
     folder.mkdir(parents=True, exist_ok=True)
     heads = {file: file.read_bytes()[: len(mark)].decode(errors="replace") for file in folder.glob("*.[ch]") if file.is_file()}
-    if foreign := [file.name for file, head in heads.items() if file.name in names and not head.startswith(MARK)]:
+    if foreign := [file.name for file, head in heads.items() if file.name in names and not head.startswith(FILE_MARK)]:
         raise ArgumentError(f"{folder} has {', '.join(foreign)}, which udkjax did not write: choose another folder")
     for file, head in heads.items():
         if head == mark:
@@ -169,7 +169,7 @@ def scene_files(scene: SceneCode, what: Sequence[str], parameters: Sequence[str]
     header = _header(scene, {name: unit for name, (_, unit) in units.items()}, names[1])
     files = {f"{scene.prefix}.h": header, f"{scene.prefix}_numbers.c": _numbers(scene, names)}
     files |= {f"{scene.prefix}_{name}.c": text for name, (text, _) in units.items()}
-    if DIFFERENTIATED & {*units}:
+    if DIFFERENTIATED_UNITS & {*units}:
         files[f"{scene.prefix}_along.c"] = f'#include "{scene.prefix}.h"\n{scene.parameters(parameters, along=True)[0]}'
     return files, {name: unit for name, (_, unit) in units.items()}
 
@@ -184,8 +184,8 @@ def _header(scene: SceneCode, units: dict[str, CUnit], parameters: dict[str, flo
     memory = "\n".join(
         f"#define {big}_{k.upper()}_MEMORY {u.memory} /* numbers, {8 * u.memory} bytes */" for k, u in units.items()
     )
-    documented = "\n".join(DOCUMENTED[name].format(**fill) for name in units)
-    documented += f"\n{ALONG.format(p=p)}" if DIFFERENTIATED & {*units} else ""
+    documented = "\n".join(FUNCTION_COMMENTS[name].format(**fill) for name in units)
+    documented += f"\n{PARAMETERS_ALONG_TEXT.format(p=p)}" if DIFFERENTIATED_UNITS & {*units} else ""
     bodies = comment_text(", ".join(scene.mechanism.body_names))
     return f"""/* {comment_text(scene.mechanism.name or "a mechanism")}, by udkjax {versions()["udkjax"]}.
 
@@ -200,7 +200,7 @@ def _header(scene: SceneCode, units: dict[str, CUnit], parameters: dict[str, flo
 #define {big}_COORDINATES {scene.n}
 #define {big}_NUMBERS {len(scene.numbers)}
 #define {big}_PARAMETERS {len(parameters)}
-#define {big}_INFO {len(INFO) + 2 * scene.n}
+#define {big}_INFO {len(INFO_PLACES) + 2 * scene.n}
 {memory}
 
 extern const double {p}_numbers[{big}_NUMBERS];
@@ -246,7 +246,7 @@ def _main(scene: SceneCode) -> str:
     units = ("m", "m", "rad"), ("m/s", "m/s", "rad/s")
     columns = [f"body.{b}.{x} [{u}]" for names, of in zip((("x", "y", "angle"), rates), units, strict=True)
                for b in bodies for x, u in zip(names, of, strict=True)]  # fmt: skip
-    counts = ", ".join(f"info[{INFO[name]}]" for name in ("t", "tried", "accepted", "evaluations"))
+    counts = ", ".join(f"info[{INFO_PLACES[name]}]" for name in ("t", "tried", "accepted", "evaluations"))
     quoted = [f'"{x.replace(chr(34), 2 * chr(34))}"' if re.search(r'[",\n\r]', x) else x for x in columns]  # as in tables of runs
     heading = ",\n    ".join(string_text(f",{x}") for x in quoted)
     return f"""/* Run the scene, and print its motion: a table with a row for each time. */

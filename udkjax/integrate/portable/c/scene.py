@@ -32,7 +32,7 @@ from udkjax.scene.elements.bodies import GROUND
 from udkjax.scene.mechanism import Mechanism
 from udkjax.wording import quote
 
-RESULTS = {
+RESULT_OF_STATUS = {
     Status.DONE: Result.successful,
     Status.STEP_LIMIT: Result.step_limit,
     Status.NOT_FINITE: Result.not_finite,
@@ -42,7 +42,7 @@ RESULTS = {
     Status.MISSING_RANK: Result.missing_rank,
 }
 OTHER_FILES = "fmi3", "fmu", "model"  # names of the headers and sources of an FMU
-INFO = {name: k for k, name in enumerate(RunStates.info_names)}  # places in the result "info"
+INFO_PLACES = {name: k for k, name in enumerate(RunStates.info_names)}  # places in the result "info"
 
 
 class SceneCode:
@@ -131,7 +131,7 @@ int {self.prefix}_run(const double *numbers, const double *ts, int times, const 
         return f"""
 int {self.prefix}_{name}(const double *numbers, double t, double dt, {state}, double *memory)
 {{
-    double ts[2], qs[{2 * n}], vs[{2 * n}], violation[2], info[{len(INFO) + 2 * n}]{declared};
+    double ts[2], qs[{2 * n}], vs[{2 * n}], violation[2], info[{len(INFO_PLACES) + 2 * n}]{declared};
     ts[0] = t;
     ts[1] = t + dt;
     const double most_steps = {number_text(MOST_STEPS_OF_INTERVAL)};
@@ -152,7 +152,7 @@ int {self.prefix}_{name}(const double *numbers, double t, double dt, {state}, do
         """Return the unit of an operation that integrates, and the C text of it and of a function `integrate` that calls it."""
         unit = c_unit(operation, int(bool(along)))
         rate, length = (number_text(float(x)) for x in (self.analysis.scales.rate, self.analysis.scales.length))
-        results = [int(RESULTS.get(k, Result.step_too_small)) for k in range(Status.MISSING_RANK + 1)]
+        results = [int(RESULT_OF_STATUS.get(k, Result.step_too_small)) for k in range(Status.MISSING_RANK + 1)]
         arrays = ("numbers", "ts", "q", "v", "rows", "breaks", "times", "qs", "vs", "violation", "info", *along, *found)
         arrays += ("samples",) if self.operation.sampled else ()
         values = dict(zip(arrays, arrays, strict=True)) | {"settings": "own", "knots": str(len(self.inputs["breaks"]))}
@@ -183,8 +183,9 @@ static int integrate(const double *numbers, const double *ts, int times, const d
     own[{columns["max_steps"]}] = most_steps;
 {unit.call_record(values)}
     run_member(call, memory, 0);
-    if (info[{INFO["lost"]}] < times) return info[{INFO["lost"]}] > 0 ? {int(Result.drift)} : {int(Result.initial_state_open)};
-    return results[(int)info[{INFO["code"]}]];
+    if (info[{INFO_PLACES["lost"]}] < times)
+        return info[{INFO_PLACES["lost"]}] > 0 ? {int(Result.drift)} : {int(Result.initial_state_open)};
+    return results[(int)info[{INFO_PLACES["code"]}]];
 }}
 """
         return unit, text

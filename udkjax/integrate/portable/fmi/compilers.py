@@ -9,20 +9,20 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Literal, get_args
 
-from udkjax.extras import ZIG, cure
+from udkjax.extras import ZIG_PACKAGES, cure
 from udkjax.requirements import ArgumentError
 
 Platform = Literal["x86_64-linux", "aarch64-linux", "x86_64-windows", "x86_64-darwin", "aarch64-darwin"]  # as in FMI
-TARGETS: dict[str, str] = {
+ZIG_TARGETS: dict[str, str] = {
     "x86_64-linux": "x86_64-linux-gnu.2.17",
     "aarch64-linux": "aarch64-linux-gnu.2.17",
     "x86_64-windows": "x86_64-windows-gnu",
     "x86_64-darwin": "x86_64-macos",
     "aarch64-darwin": "aarch64-macos",
 }
-SUFFIXES = {"linux": ".so", "windows": ".dll", "darwin": ".dylib"}
-OPTIONS = ("-std=c99", "-shared", "-fPIC", "-fvisibility=hidden", "-ffp-contract=off")
-LONGEST = 1200  # s, of a compilation
+LIBRARY_SUFFIXES = {"linux": ".so", "windows": ".dll", "darwin": ".dylib"}
+COMPILER_OPTIONS = ("-std=c99", "-shared", "-fPIC", "-fvisibility=hidden", "-ffp-contract=off")
+MOST_COMPILE_SECONDS = 1200  # s, of a compilation
 
 
 def this_platform() -> str:
@@ -41,9 +41,11 @@ def compiler_for(name: str) -> list[str]:
         raise ArgumentError(f"platforms must be among {', '.join(get_args(Platform))}, not {name}")
     if name == this_platform() and (own := next(filter(None, map(shutil.which, ("cc", "gcc", "clang"))), None)):
         return [own]
-    if find_spec(*ZIG) is None:
-        raise ArgumentError(f"there is no C compiler for {name}: {cure(ZIG)}, or give platforms=[] for an FMU of sources")
-    return [sys.executable, "-m", "ziglang", "cc", "-target", TARGETS[name]]
+    if find_spec(*ZIG_PACKAGES) is None:
+        raise ArgumentError(
+            f"there is no C compiler for {name}: {cure(ZIG_PACKAGES)}, or give platforms=[] for an FMU of sources"
+        )
+    return [sys.executable, "-m", "ziglang", "cc", "-target", ZIG_TARGETS[name]]
 
 
 def compile_library(command: Sequence[str], name: str, sources: Sequence[Path], to: Path, options: Sequence[str]) -> None:
@@ -53,7 +55,9 @@ def compile_library(command: Sequence[str], name: str, sources: Sequence[Path], 
         ArgumentError: the compiler failed; the message has its output.
     """
     libraries = [] if name.endswith("windows") else ["-lm"]
-    words = [*command, *OPTIONS, *options, *(x.name for x in sources), "-o", str(to.resolve()), *libraries]
-    found = subprocess.run(words, cwd=sources[0].parent, capture_output=True, text=True, timeout=LONGEST, check=False)
+    words = [*command, *COMPILER_OPTIONS, *options, *(x.name for x in sources), "-o", str(to.resolve()), *libraries]
+    found = subprocess.run(
+        words, cwd=sources[0].parent, capture_output=True, text=True, timeout=MOST_COMPILE_SECONDS, check=False
+    )
     if found.returncode:
         raise ArgumentError(f"{' '.join(words[:3])} failed for {name}: {found.stderr.strip()[-2000:]}")

@@ -7,10 +7,10 @@ from xml.sax.saxutils import quoteattr
 from udkjax.integrate.portable.fmi.variables import FMUVariable, FMUVariables
 from udkjax.integrate.solution import versions
 
-BASES = {"m": {"m": 1}, "kg": {"kg": 1}, "s": {"s": 1}, "rad": {"rad": 1}, "N": {"kg": 1, "m": 1, "s": -2}}
-ABLE = {"canGetAndSetFMUState": "true", "canSerializeFMUState": "true"}
-DIFFERENTIABLE = {"providesDirectionalDerivatives": "true", "providesAdjointDerivatives": "true"}
-KINDS = {  # in the order of the schema
+BASE_UNITS = {"m": {"m": 1}, "kg": {"kg": 1}, "s": {"s": 1}, "rad": {"rad": 1}, "N": {"kg": 1, "m": 1, "s": -2}}
+STATE_CAPABILITIES = {"canGetAndSetFMUState": "true", "canSerializeFMUState": "true"}
+DERIVATIVE_CAPABILITIES = {"providesDirectionalDerivatives": "true", "providesAdjointDerivatives": "true"}
+INTERFACE_KINDS = {  # in the order of the schema
     "model-exchange": ("ModelExchange", {"needsCompletedIntegratorStep": "true"}),
     "co-simulation": ("CoSimulation", {"canHandleVariableCommunicationStepSize": "true"}),
 }
@@ -31,8 +31,8 @@ def model_description(
         rtol: relative tolerance.
     """
     exchange = "model-exchange" in kinds
-    able = ABLE | (DIFFERENTIABLE if exchange else {})
-    interfaces = [_tag(KINDS[kind][0], {"modelIdentifier": prefix} | KINDS[kind][1] | able) for kind in kinds]
+    able = STATE_CAPABILITIES | (DERIVATIVE_CAPABILITIES if exchange else {})
+    interfaces = [_tag(INTERFACE_KINDS[kind][0], {"modelIdentifier": prefix} | INTERFACE_KINDS[kind][1] | able) for kind in kinds]
     start, stop, step = times
     experiment = {"startTime": start, "stopTime": stop, "tolerance": rtol, "stepSize": step}
     units = sorted(
@@ -85,7 +85,7 @@ def base_unit(unit: str) -> dict[str, str]:
     found: dict[str, int] = {}
     for side, sign in zip(unit.split("/"), (1, -1), strict=False):
         for name, exponent in re.findall(r"([A-Za-z]+)(\d*)", side):
-            for base, count in BASES[name].items():
+            for base, count in BASE_UNITS[name].items():
                 found[base] = found.get(base, 0) + sign * count * int(exponent or 1)
     return {base: str(count) for base, count in found.items() if count}
 

@@ -14,8 +14,8 @@ from udkjax.argument_types import NOT_NEGATIVE, POSITIVE
 from udkjax.equations.rows.position_closure import CLOSURE
 from udkjax.integrate.portable.c.folder import scene_files
 from udkjax.integrate.portable.c.scene import SceneCode, string_text, table
-from udkjax.integrate.portable.fmi.compilers import SUFFIXES, Platform, compile_library, compiler_for, this_platform
-from udkjax.integrate.portable.fmi.description import KINDS, build_description, model_description
+from udkjax.integrate.portable.fmi.compilers import LIBRARY_SUFFIXES, Platform, compile_library, compiler_for, this_platform
+from udkjax.integrate.portable.fmi.description import INTERFACE_KINDS, build_description, model_description
 from udkjax.integrate.portable.fmi.variables import FMUVariables, least_of
 from udkjax.integrate.portable.parameters import guess_of, places_of_numbers
 from udkjax.native.c import c_function
@@ -24,10 +24,10 @@ from udkjax.scene.arguments import checked
 from udkjax.scene.mechanism import Mechanism
 
 Kind = Literal["co-simulation", "model-exchange"]
-SOURCES = Path(__file__).parent / "sources"
-DECAY = 10.0  # of drift, in units of the rate of the scene: faster than the motion, and not stiff for explicit methods
-EPOCH = 1980, 1, 1, 0, 0, 0  # of files: the same scene gives the same bytes
-ALIASES = {
+SOURCES_FOLDER = Path(__file__).parent / "sources"
+DRIFT_DECAY = 10.0  # of drift, in units of the rate of the scene: faster than the motion, and not stiff for explicit methods
+FILE_TIME = 1980, 1, 1, 0, 0, 0  # of files: the same scene gives the same bytes
+FUNCTION_ALIASES = {
     "positions": ("SCENE_CLOSE", "close"),
     "projection": ("SCENE_PROJECT", "project"),
     "accelerations": ("SCENE_ACCELERATIONS", "accelerations"),
@@ -106,9 +106,9 @@ def export_fmu(
         AssemblyError: the initial guess cannot be closed.
     """
     mechanism.require_masses("exported accelerations")
-    chosen: list[str] = [kind for kind in KINDS if kind in kinds]
-    if not kinds or set(kinds) - set(KINDS):
-        raise ArgumentError(f"kinds must be a list of {', '.join(KINDS)}, not {', '.join(map(str, kinds)) or 'empty'}")
+    chosen: list[str] = [kind for kind in INTERFACE_KINDS if kind in kinds]
+    if not kinds or set(kinds) - set(INTERFACE_KINDS):
+        raise ArgumentError(f"kinds must be a list of {', '.join(INTERFACE_KINDS)}, not {', '.join(map(str, kinds)) or 'empty'}")
     if not t1 > t0:
         raise ArgumentError(f"t1 must be later than t0 = {t0:g} s, not {t1:g} s")
     to = [this_platform()] if platforms is None else [str(x) for x in platforms]
@@ -122,7 +122,7 @@ def export_fmu(
         body = "{\n    measure((double *)(uintptr_t)at, found);\n}\n"
         texts[f"{scene.prefix}_measure.c"] = f"{c_function(variables.measure())}\n{head};\n{head}\n{body}"
     model = _model(scene, variables, what, max(unit.memory for unit in units.values()), chosen)
-    texts |= {name: (SOURCES / name).read_text(encoding="ascii") for name in ("fmi3.h", "fmu.c")}
+    texts |= {name: (SOURCES_FOLDER / name).read_text(encoding="ascii") for name in ("fmi3.h", "fmu.c")}
     token = hashlib.sha256(json.dumps([texts, model], sort_keys=True).encode()).hexdigest()
     texts["model.h"] = f'{model}#define TOKEN "{token}"\n\n#endif\n'
     times = t0, t1, dt
@@ -134,7 +134,7 @@ def export_fmu(
 
 
 def _further(scene: SceneCode, kinds: Sequence[str]) -> list[str]:
-    """Return the names of the C functions (`ALIASES`) that an FMU needs in addition to the run."""
+    """Return the names of the C functions (`FUNCTION_ALIASES`) that an FMU needs in addition to the run."""
     closing = ["positions"] if scene.analysis.scales.rows.size else []
     if "model-exchange" not in kinds:
         return closing
@@ -148,7 +148,7 @@ def _further(scene: SceneCode, kinds: Sequence[str]) -> list[str]:
 def _model(scene: SceneCode, variables: FMUVariables, what: Sequence[str], memory: int, kinds: Sequence[str]) -> str:
     """Return the text of model.h without its last lines: the constants of the scene for fmu.c."""
     p, big, values = scene.prefix, scene.prefix.upper(), variables.values
-    lines = [f"#define {name} {p}_{function}" for key, (name, function) in ALIASES.items() if key in what]
+    lines = [f"#define {name} {p}_{function}" for key, (name, function) in FUNCTION_ALIASES.items() if key in what]
     lines += [f"#define scene_{x} {p}_{x}" for x in ("numbers", "q0", "v0", "set_parameters", "result_name", "step")]
     if "model-exchange" in kinds:
         lines += ["#define MODEL_EXCHANGE", f"#define SCENE_SET_ALONG {p}_set_parameters_along"]
@@ -175,7 +175,7 @@ def _model(scene: SceneCode, variables: FMUVariables, what: Sequence[str], memor
 #define BREAKS {len(breaks)}
 #define MEMORY {memory}
 #define CLOSED {CLOSURE.tol!r} /* largest violation of constraints, over the scales of their rows, that counts as closed */
-#define DECAY {DECAY * rate!r} /* rate at which drift from the constraints decays in model exchange (1/s) */
+#define DECAY {DRIFT_DECAY * rate!r} /* rate at which drift from the constraints decays in model exchange (1/s) */
 #define START_TIME {float(scene.ts[0])!r}
 {chr(10).join(lines)}
 
@@ -210,9 +210,9 @@ def _write(
         contents["sources/buildDescription.xml"] = build_description(prefix, code).encode()
         contents |= {f"sources/{name}": (folder / name).read_bytes() for name in texts}
         for platform, command in commands.items():
-            name = f"{prefix}{SUFFIXES[platform.rpartition('-')[2]]}"
+            name = f"{prefix}{LIBRARY_SUFFIXES[platform.rpartition('-')[2]]}"
             compile_library(command, platform, [folder / x for x in code], folder / name, options)
             contents[f"binaries/{platform}/{name}"] = (folder / name).read_bytes()
         with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
             for name, data in contents.items():
-                archive.writestr(zipfile.ZipInfo(name, EPOCH), data, zipfile.ZIP_DEFLATED)
+                archive.writestr(zipfile.ZipInfo(name, FILE_TIME), data, zipfile.ZIP_DEFLATED)

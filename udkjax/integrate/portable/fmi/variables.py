@@ -24,9 +24,9 @@ from udkjax.scene.tables.checks import SceneError
 
 COLUMNS = ("x", "y", "angle"), ("vx", "vy", "omega"), ("ax", "ay", "alpha")  # of a body, as in tables of runs
 UNITS = ("m", "m", "rad"), ("m/s", "m/s", "rad/s"), ("m/s2", "m/s2", "rad/s2")
-CONTROLLED = {Torque: "value", Force: "vector"}  # numbers of force elements that are inputs unless others are named
-FIELDS = ("value", "vector", "torque", "force")  # their names in scenes and in drawings
-POSES = ("position", "angle", "velocity", "angular_velocity")  # of a body: the start values of states
+INPUT_FIELDS = {Torque: "value", Force: "vector"}  # numbers of force elements that are inputs unless others are named
+INPUT_FIELD_NAMES = ("value", "vector", "torque", "force")  # their names in scenes and in drawings
+START_FIELDS = ("position", "angle", "velocity", "angular_velocity")  # of a body: the start values of states
 
 
 class FMUVariable(NamedTuple):
@@ -150,8 +150,8 @@ def _controlled(mechanism: Mechanism) -> list[str]:
         section, _, rest = name.partition(".")
         owner, _, field = rest.rpartition(".")
         element = mechanism.forces.get(owner)
-        own = CONTROLLED.get(type(element)) if section in ("force", "load") else None
-        if own and field in FIELDS and not isinstance(getattr(element, own), Held):
+        own = INPUT_FIELDS.get(type(element)) if section in ("force", "load") else None
+        if own and field in INPUT_FIELD_NAMES and not isinstance(getattr(element, own), Held):
             found.append(name)
     return found
 
@@ -162,7 +162,7 @@ def _parameters(mechanism: Mechanism) -> dict[str, float]:
     Poses and velocities are left out, as are parameters that move times at which the motion is not smooth.
     """
     found = scalar_parameters(mechanism)
-    values = {k: x for k, x in found.items() if not re.match(rf"body\..*\.({'|'.join(POSES)})(\[|$)", k)}
+    values = {k: x for k, x in found.items() if not re.match(rf"body\..*\.({'|'.join(START_FIELDS)})(\[|$)", k)}
     values = {k: x for k, x in values.items() if not k.endswith(".velocity") and ".velocity[" not in k}
     if _moves_times(mechanism, values):
         values = {k: x for k, x in values.items() if not _moves_times(mechanism, {k: x})}

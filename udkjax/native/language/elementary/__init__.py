@@ -6,6 +6,6 @@ last place (ulp), or below two for sinh, cosh, tanh, asinh, acosh, atanh, erf an
 are larger by less than one ulp.
 """
 
-from udkjax.native.language.elementary.calls import NAMES, call
+from udkjax.native.language.elementary.calls import FUNCTION_NAMES, call
 
-__all__ = ["NAMES", "call"]
+__all__ = ["FUNCTION_NAMES", "call"]

@@ -23,12 +23,12 @@ _BODIES: dict[str, Callable[..., Value]] = {
     "tan": tangent_function.tan,
     "rem": remainders.rem,
 }
-NAMES = frozenset(_BODIES)
+FUNCTION_NAMES = frozenset(_BODIES)
 _TWO_ARGUMENTS = ("atan2", "pow", "rem")
 
 
 def call(f: Function, name: str, *arguments: Operand) -> Value:
-    """Return the elementary function `name` (of `NAMES`) of numbers, lane by lane, by a call of its function."""
+    """Return the elementary function `name` (of `FUNCTION_NAMES`) of numbers, lane by lane, by a call of its function."""
     width = max((x.width for x in arguments if isinstance(x, Value)), default=1)
     return f.evaluate(_function(name, width), *(f.like(x, DOUBLE, width) for x in arguments))
 

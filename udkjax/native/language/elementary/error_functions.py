@@ -22,7 +22,7 @@ ERFC = (
     3.4525197016153044e-06, 3.0307407103093377e-07, -5.840747551910045e-07, -8.42551957399924e-08, 7.124245030572795e-08,
     8.635681414307825e-09,
 )  # fmt: skip
-VANISHING = 27.3  # erfc x vanishes above
+VANISHING_ARGUMENT = 27.3  # erfc x vanishes above
 
 
 def _small_part(f: Function, size: Value) -> Value:
@@ -33,7 +33,7 @@ def _small_part(f: Function, size: Value) -> Value:
 
 def _complement(f: Function, x: Value) -> Value:
     """Return erfc x for x >= 1/2."""
-    x = f.select(x > VANISHING, VANISHING, x)
+    x = f.select(x > VANISHING_ARGUMENT, VANISHING_ARGUMENT, x)
     upper = upper_half(x)
     low = rounded((upper - x) * (upper + x))
     e = reduce(f, -rounded(upper * upper), low)

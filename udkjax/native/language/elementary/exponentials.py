@@ -17,7 +17,7 @@ EXP = (
     0.1666666666666667, 0.04166666666666667, 0.008333333333326136, 0.0013888888888883748, 0.00019841269874820627,
     2.4801587325547743e-05, 2.7557255400206422e-06, 2.75572736431103e-07, 2.5105217004720745e-08, 2.0914686968086876e-09,
 )  # fmt: skip
-LARGEST, SMALLEST = 710.7, -746.0  # e^x, and sinh x, overflow above; e^x vanishes below
+LARGEST_ARGUMENT, SMALLEST_ARGUMENT = 710.7, -746.0  # e^x, and sinh x, overflow above; e^x vanishes below
 NEGLIGIBLE = 2.0**-54  # below, expm1 x rounds to x
 
 
@@ -64,7 +64,7 @@ def clamp(x: Value, smallest: float, largest: float) -> Value:
 
 def exp(f: Function, x: Value) -> Value:
     """Return e^x."""
-    e = reduce(f, clamp(x, SMALLEST, LARGEST))
+    e = reduce(f, clamp(x, SMALLEST_ARGUMENT, LARGEST_ARGUMENT))
     return scale(e.fraction, e.n)
 
 
@@ -91,14 +91,14 @@ def _quarter_expm1(f: Function, x: Value) -> tuple[Value, Value]:
 
 def expm1(f: Function, x: Value) -> Value:
     """Return e^x - 1, accurate also for small x."""
-    result = rounded(_quarter_expm1(f, clamp(x, -40.0, LARGEST))[0] * 4.0)
+    result = rounded(_quarter_expm1(f, clamp(x, -40.0, LARGEST_ARGUMENT))[0] * 4.0)
     return f.select(f.abs(x) < NEGLIGIBLE, x, result)
 
 
 def sinh(f: Function, x: Value) -> Value:
     """Return sinh x, with t = e^|x| - 1: t - t^2 / (2 t + 2) for small |x|, (t + t / (t + 1)) / 2 for large."""
     size = f.abs(x)
-    quarter, _ = _quarter_expm1(f, f.select(size > LARGEST, LARGEST, size))
+    quarter, _ = _quarter_expm1(f, f.select(size > LARGEST_ARGUMENT, LARGEST_ARGUMENT, size))
     t = rounded(quarter * 4.0)
     small = size < 1.0
     ratio = rounded(f.select(small, t, 1.0) * quarter) / (t + 1.0)
@@ -109,7 +109,7 @@ def sinh(f: Function, x: Value) -> Value:
 def cosh(f: Function, x: Value) -> Value:
     """Return cosh x = E / 2 + 1 / (2 E), with E = e^|x|; E / 4 does not overflow."""
     size = f.abs(x)
-    e = reduce(f, f.select(size > LARGEST, LARGEST, size))
+    e = reduce(f, f.select(size > LARGEST_ARGUMENT, LARGEST_ARGUMENT, size))
     quarter = rounded(e.fraction * power_of_two(e.n - 2))
     return rounded((quarter + 0.0625 / quarter) * 2.0)
 

@@ -24,7 +24,7 @@ PI = (3.141592653589793, 1.2246467991473532e-16)
 HALF_PI = (PI[0] / 2, PI[1] / 2)
 QUARTER_PI = (PI[0] / 4, PI[1] / 4)
 FIRST_EDGE, SECOND_EDGE = 7.0 / 16.0, 11.0 / 16.0
-BEYOND = 2.0**70  # the arctangent of larger numbers rounds to pi / 2
+LARGE_ARGUMENT = 2.0**70  # the arctangent of larger numbers rounds to pi / 2
 
 
 def _arc(f: Function, numerator: Value, denominator: Value) -> tuple[Value, Value]:
@@ -54,7 +54,7 @@ def atan(f: Function, x: Value) -> Value:
     """Return the arctangent."""
     size = f.abs(x)
     steep = size > 1.0
-    bounded = f.select(size > BEYOND, BEYOND, size)
+    bounded = f.select(size > LARGE_ARGUMENT, LARGE_ARGUMENT, size)
     parts = _arc(f, f.select(steep, 1.0, bounded), f.select(steep, bounded, 1.0))
     high, low = _less(f, steep, HALF_PI, *parts)
     return copy_sign(high + low, x)

@@ -4,12 +4,12 @@ from collections.abc import Sequence
 
 from udkjax.native.language.ir import DOUBLE, INT, Function, Operand, Value, llvm_type
 
-FRACTION, BIAS = 52, 1023  # of float64
-SIGN = -(2**63)
-FRACTION_MASK, ONE = 2**FRACTION - 1, BIAS << FRACTION
+FRACTION_BITS, EXPONENT_BIAS = 52, 1023  # of float64
+SIGN_BIT = -(2**63)
+FRACTION_MASK, BITS_OF_ONE = 2**FRACTION_BITS - 1, EXPONENT_BIAS << FRACTION_BITS
 UPPER_HALF = -(2**27)  # the upper 26 digits: products of two such numbers are exact
 SMALLEST_NORMAL, INFINITY, NAN = 2.0**-1022, float("inf"), float("nan")
-ROUND = 1.5 * 2.0**52  # added to a number, leaves the nearest integer in the last digits of the sum
+ROUNDING_SHIFT = 1.5 * 2.0**52  # added to a number, leaves the nearest integer in the last digits of the sum
 
 
 def bits(x: Value) -> Value:
@@ -62,7 +62,7 @@ def any_unusual(x: Value) -> Value:
 
 def power_of_two(b: Value) -> Value:
     """Return 2^k, where k is the integer in the lowest 11 bits of b."""
-    return from_bits(shift(b + BIAS, "shl", FRACTION))
+    return from_bits(shift(b + EXPONENT_BIAS, "shl", FRACTION_BITS))
 
 
 def rounded(x: Value) -> Value:
@@ -73,8 +73,8 @@ def rounded(x: Value) -> Value:
 
 def nearest(f: Function, x: Operand, factor: float = 1.0) -> tuple[Value, Value]:
     """Return the integer nearest to x * factor, as a number and in the lowest bits of an integer."""
-    shifted = f.fma(x, factor, ROUND) if factor != 1.0 else f.arithmetic("add", x, ROUND)
-    return shifted - ROUND, bits(shifted)
+    shifted = f.fma(x, factor, ROUNDING_SHIFT) if factor != 1.0 else f.arithmetic("add", x, ROUNDING_SHIFT)
+    return shifted - ROUNDING_SHIFT, bits(shifted)
 
 
 def polynomial(x: Value, coefficients: Sequence[float]) -> Value:
@@ -102,21 +102,21 @@ class Normal:
 
     def __init__(self, x: Value):
         self._x = x
-        self.number, self._bias = x.f.variable(x, DOUBLE, x.width), x.f.variable(float(BIAS), DOUBLE, x.width)
+        self.number, self._bias = x.f.variable(x, DOUBLE, x.width), x.f.variable(float(EXPONENT_BIAS), DOUBLE, x.width)
 
     def scale(self):
         """Multiply subnormal numbers by 2^54."""
         tiny = self.number.value < SMALLEST_NORMAL
-        self._bias.where(tiny, BIAS + 54.0)
+        self._bias.where(tiny, EXPONENT_BIAS + 54.0)
         self.number.where(tiny, self.number.value * 2.0**54)
 
     def mantissa(self, start: int) -> tuple[Value, Value]:
         """Return k and m with x = 2^k m, where m is between the number whose bits are `start` and twice this number."""
-        b = bits(self.number.value) + (ONE - start)
+        b = bits(self.number.value) + (BITS_OF_ONE - start)
         m = from_bits(mask(b, FRACTION_MASK) + start)
-        return small_integer(shift(b, "lshr", FRACTION)) - self._bias.value, m
+        return small_integer(shift(b, "lshr", FRACTION_BITS)) - self._bias.value, m
 
 
 def small_integer(k: Value) -> Value:
     """Convert nonnegative integers below 2^52 to numbers, through the digits of 2^52 + k."""
-    return from_bits(k.f.logic("or", k, (BIAS + 52) << FRACTION)) - 2.0**52
+    return from_bits(k.f.logic("or", k, (EXPONENT_BIAS + 52) << FRACTION_BITS)) - 2.0**52

@@ -6,9 +6,9 @@ of y are exact, with and without fused multiply-add (the method of fdlibm).
 
 from udkjax.native.language.elementary.exponentials import LOG2, scale, series
 from udkjax.native.language.elementary.parts import (
+    BITS_OF_ONE,
     INFINITY,
     NAN,
-    ONE,
     SMALLEST_NORMAL,
     Normal,
     any_unusual,
@@ -67,7 +67,7 @@ def _unusual_power(f: Function, x: Value, y: Value, result: Value) -> Value:
 
 def _log2(f: Function, size: Normal) -> tuple[Value, Value]:
     """Return log2 of positive numbers as a sum of two doubles."""
-    exponent, m = size.mantissa(ONE)
+    exponent, m = size.mantissa(BITS_OF_ONE)
     above, middle = m >= SQRT3, m >= SQRT_THREE_HALVES
     is_shifted = middle & ~above  # compared with 3/2, otherwise with one
     exponent = exponent + f.select(above, 1.0, 0.0)

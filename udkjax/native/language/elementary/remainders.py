@@ -4,7 +4,7 @@ from udkjax.native.language.elementary.parts import INFINITY, NAN, copy_sign, up
 from udkjax.native.language.ir import Function, Value
 
 # The quotient x / y may have more than 53 digits. The remainder of x / (2^k y) is smaller, and has the same remainder as x.
-DIGITS = 50
+QUOTIENT_DIGITS = 50
 
 
 def rem(f: Function, x: Value, y: Value) -> Value:
@@ -14,13 +14,13 @@ def rem(f: Function, x: Value, y: Value) -> Value:
     divisor = f.variable(f.select(size.is_(0.0), NAN, size), width=width)
 
     def is_far() -> Value:
-        return divisor.value * 2.0 ** (DIGITS + 2) <= rest.value
+        return divisor.value * 2.0 ** (QUOTIENT_DIGITS + 2) <= rest.value
 
     with f.while_(lambda: f.any_of(is_far())):
-        divisor.where(is_far(), divisor.value * 2.0**DIGITS)
+        divisor.where(is_far(), divisor.value * 2.0**QUOTIENT_DIGITS)
     with f.while_(lambda: f.any_of(divisor.value >= size)):
         rest.where(divisor.value >= size, _remainder(f, rest.value, divisor.value))
-        divisor.value = f.select(divisor.value > size, divisor.value * 2.0**-DIGITS, -1.0)
+        divisor.value = f.select(divisor.value > size, divisor.value * 2.0**-QUOTIENT_DIGITS, -1.0)
     result = f.select(size.is_(INFINITY) & f.is_finite(x), x, f.select(size > 0.0, rest.value, NAN))
     return copy_sign(result, x)
 

@@ -10,8 +10,8 @@ from itertools import pairwise
 from typing import NamedTuple
 
 from udkjax.native.language.elementary.parts import (
-    BIAS,
-    FRACTION,
+    EXPONENT_BIAS,
+    FRACTION_BITS,
     FRACTION_MASK,
     INFINITY,
     bits,
@@ -32,22 +32,22 @@ TAN = (
     0.001455827652166713, 0.0005900909812582525, 0.0002387297273808411, 9.861961520829385e-05, 3.4347715640588505e-05,
     2.534862386702702e-05, -4.710062975941994e-06, 9.529056816186938e-06,
 )  # fmt: skip
-EDGE = 0.67434
+LARGE_ANGLE = 0.67434
 QUARTER_PI = (math.pi / 4, 3.061616997868383e-17)
 # pi / 2: the first three have 33 digits; their multiples up to 2^20 are exact
 HALF_PI = tuple(
     map(float.fromhex, ("0x1.921fb54400000p+0", "0x1.0b4611a600000p-34", "0x1.3198a2e000000p-69", "0x1.b839a252049c1p-104"))
 )
-FAR = 2.0**20
+FAR_ANGLE = 2.0**20
 HALF_PI_HALVES = (1.5707963109016418, 1.5893254773528196e-08)  # pi / 2; the first has 26 digits
 # 64 zeros and 1,216 binary digits of 2 / pi
-DIGITS = (
+DIGITS_OF_TWO_OVER_PI = (
     0x0000000000000000, 0xA2F9836E4E441529, 0xFC2757D1F534DDC0, 0xDB6295993C439041, 0xFE5163ABDEBBC561, 0xB7246E3A424DD2E0,
     0x06492EEA09D1921C, 0xFE1DEB1CB129A73E, 0xE88235F52EBB4484, 0xE99C7026B45F7E41, 0x3991D639835339F4, 0x9C845F8BBDF9283B,
     0x1FF897FFDE05980F, 0xEF2F118B5A0A6D1F, 0x6D367ECF27CB09B7, 0x4F463F669E5FEA2D, 0x7527BAC7EBE5F17B, 0x3D0739F78A5292EA,
     0x6BFB5FB11F8D5D08, 0x56033046FC7B6BAB,
 )  # fmt: skip
-WORD = 2**64
+WORD_RANGE = 2**64
 LOW_HALF = 2**32 - 1
 
 
@@ -64,9 +64,9 @@ def tan(f: Function, x: Value) -> Value:
     size = f.abs(x)
     near = _near_remainder(f, x)
     high, low, n = f.variable(near.high, width=x.width), f.variable(near.low, width=x.width), f.variable(near.n, INT, x.width)
-    far = size >= FAR
+    far = size >= FAR_ANGLE
     with f.if_(f.any_of(far)):
-        remainder = _far_remainder(f, f.select(far, x, FAR))
+        remainder = _far_remainder(f, f.select(far, x, FAR_ANGLE))
         for variable, part in zip((high, low, n), remainder, strict=True):
             variable.where(far, part)
     result = _tan_of_remainder(f, _Remainder(high.value, low.value, n.value))
@@ -77,7 +77,7 @@ def _tan_of_remainder(f: Function, remainder: _Remainder) -> Value:
     odd = mask(remainder.n, 1).is_not(0)
     sign = remainder.high
     size = f.abs(remainder.high)
-    large = size >= EDGE
+    large = size >= LARGE_ANGLE
     rest = QUARTER_PI[0] - size + (QUARTER_PI[1] - flip_sign(remainder.low, sign))
     x, low = f.select(large, rest, remainder.high), f.select(large, 0.0, remainder.low)
     z = rounded(x * x)
@@ -111,8 +111,8 @@ def _near_remainder(f: Function, x: Value) -> _Remainder:
 def _far_remainder(f: Function, x: Value) -> _Remainder:
     """Return the remainder of x = m 2^e from m times 192 digits of 2 / pi, beginning with the digit of weight 2^(1 - e)."""
     b = bits(x)
-    m = f.logic("or", mask(b, FRACTION_MASK), 2**FRACTION)
-    start = mask(shift(b, "lshr", FRACTION), 2047) - (BIAS + FRACTION - 62)
+    m = f.logic("or", mask(b, FRACTION_MASK), 2**FRACTION_BITS)
+    start = mask(shift(b, "lshr", FRACTION_BITS), 2047) - (EXPONENT_BIAS + FRACTION_BITS - 62)
     w = _digits(f, start)
     p2, p1 = m * w[2], m * w[1] + _high_product(m, w[2])
     p0 = m * w[0] + _high_product(m, w[1]) + f.like(_is_below(p1, _high_product(m, w[2])), INT, x.width)
@@ -140,11 +140,11 @@ def _far_remainder(f: Function, x: Value) -> _Remainder:
 
 
 def _digits(f: Function, start: Value) -> list[Value]:
-    """Return three words of 64 bits from DIGITS, beginning at bit `start`."""
+    """Return three words of 64 bits from DIGITS_OF_TWO_OVER_PI, beginning at bit `start`."""
     index, offset = shift(start, "lshr", 6), mask(start, 63)
     words = [f.const(0, INT, start.width)] * 4
-    for k in range(len(DIGITS) - 3):
-        words = [f.select(index.is_(k), _signed(DIGITS[k + j]), words[j]) for j in range(4)]
+    for k in range(len(DIGITS_OF_TWO_OVER_PI) - 3):
+        words = [f.select(index.is_(k), _signed(DIGITS_OF_TWO_OVER_PI[k + j]), words[j]) for j in range(4)]
 
     def shifted(a: Value, b: Value) -> Value:
         left = f.op(f"shl {a.type} {a.name}, {offset.name}", INT, a.width)
@@ -155,7 +155,7 @@ def _digits(f: Function, start: Value) -> list[Value]:
 
 
 def _signed(word: int) -> int:
-    return word - WORD if word >= WORD // 2 else word
+    return word - WORD_RANGE if word >= WORD_RANGE // 2 else word
 
 
 def _high_product(a: Value, b: Value) -> Value:

@@ -28,10 +28,10 @@ Mark = JsonObject
 BodyPoints = Mapping[str, Numbers]  # points (n, 2) by body
 Poses = Float[np.ndarray, "T bodies 3"]
 PROFILE_POINTS = 180  # number of points of a cam's outline
-TOUCHING = 0.02  # relative to their distance: wheels with a larger gap are joined by a belt
-ROD = 0.01  # relative difference from the inertia of a uniform rod up to which a body is drawn as a rod
+TOUCHING_GAP = 0.02  # relative to their distance: wheels with a larger gap are joined by a belt
+ROD_TOL = 0.01  # relative difference from the inertia of a uniform rod up to which a body is drawn as a rod
 SAME_MARK = 1e-6  # relative to the size: a traced point closer to a mark is shown by it
-MARGIN = 0.08  # length of a rail beyond the used range, relative to the mechanism's length
+RAIL_MARGIN = 0.08  # length of a rail beyond the used range, relative to the mechanism's length
 
 
 def marks(
@@ -118,7 +118,7 @@ class _Drawing:
             inertia, mass = (float(getattr(self.mechanism.bodies[body], name)) for name in ("inertia", "mass"))
             reach = float(np.linalg.norm(points[0])) if single else 0.0
             # A uniform rod of length 2 r has the inertia m r^2 / 3; if attached at one end, it is drawn to its other end.
-            rod = single and abs(3 * inertia - mass * reach**2) < ROD * mass * reach**2
+            rod = single and abs(3 * inertia - mass * reach**2) < ROD_TOL * mass * reach**2
             if single and reach > SAME_PLACE * self.size:
                 points = np.concatenate([points, -points if rod else np.zeros((1, 2))])
             if len(points) > 1:
@@ -216,7 +216,7 @@ class _Drawing:
         axis = float(joint.axis)
         slot = isinstance(joint, Slot)
         start, end = self._travel(first, joint.points[0], axis, second, joint.points[1])
-        margin = MARGIN * self.size
+        margin = RAIL_MARGIN * self.size
         rail = {**self._at(first, joint.points[0]), "axis": axis, "span": [start - margin, end + margin], "slot": slot}
         self.rails.append({"kind": MarkKind.RAIL, **rail})
         if slot:
@@ -228,7 +228,7 @@ class _Drawing:
 
     def add_floor(self, gap: Gap) -> None:
         """Add the line of a contact, over the range in which the point of the contact comes close to it."""
-        (body, on), margin = gap.bodies, MARGIN * self.size
+        (body, on), margin = gap.bodies, RAIL_MARGIN * self.size
         nx, ny = np.asarray(gap.normal, float)
         axis = float(np.arctan2(-nx, ny))
         gap_vector, turned = self._path(body, gap.point) - self._path(on, gap.through), axis + self._frames(on)[:, 2]
@@ -286,7 +286,7 @@ class _Drawing:
         centres = [in_frame(carrier, axle) for axle in axles]
         arm = centres[1] - centres[0]
         distance, reach = float(np.hypot(*arm)), radii[0] - radii[1] if joint.internal else radii[0] + radii[1]
-        if abs(distance - abs(reach)) <= TOUCHING * distance or distance <= abs(reach):
+        if abs(distance - abs(reach)) <= TOUCHING_GAP * distance or distance <= abs(reach):
             return []
         strands, along = [], np.arctan2(arm[1], arm[0])
         for side in (1.0, -1.0):  # the normal of a strand has the angle acos(reach / distance) to the line of centres
@@ -312,7 +312,7 @@ class _Drawing:
 
     def _thread(self, joint: Screw) -> None:
         first, second = joint.bodies
-        axis, margin = float(joint.axis), MARGIN * self.size
+        axis, margin = float(joint.axis), RAIL_MARGIN * self.size
         origin = in_frame(self._frames(first)[0], self._path(second, joint.points[1])[0])
         start, end = self._travel(first, origin, axis, second, joint.points[1])
         span = [start - margin, end + margin]
@@ -320,7 +320,7 @@ class _Drawing:
 
     def _edge(self, joint: KnifeEdge) -> None:
         k, axis, point = self.number[joint.bodies[1]], float(joint.axis), np.asarray(joint.point, float)
-        along = MARGIN * self.size * np.array([np.cos(axis), np.sin(axis)])
+        along = RAIL_MARGIN * self.size * np.array([np.cos(axis), np.sin(axis)])
         ends = ([k, *(point + sign * along).tolist()] for sign in (-1.0, 1.0))
         self.elements.append({"kind": MarkKind.ROD, **dict(zip("ab", ends, strict=True))})
 

@@ -27,14 +27,14 @@ THEMES: dict[str, dict[str, Any]] = {
         "bodies": ["#4fb0ec", "#ff9055", "#3fcfa4", "#ea9fcb", "#93d2f6", "#f0bb4a", "#ab9cf2"],
     },
 }  # fmt: skip
-POINT = 420.0  # shorter side (px) of a picture in which the unit of symbols is one pixel
+UNIT_PICTURE_SIDE = 420.0  # shorter side (px) of a picture in which the unit of symbols is one pixel
 MARGIN = 44.0  # margin of a picture (px)
-ARROW, LONGEST_ARROW = 70.0, 3.0  # arrow of the usual force in units of symbols; the longest arrow relative to this one
-HEAD, HEAD_ANGLE, ARROW_WIDTH = 7.5, 0.42, 2.2  # head and width in units of symbols; half of the head's angle (rad)
+ARROW_LENGTH, LONGEST_ARROW = 70.0, 3.0  # arrow of the usual force in units of symbols; the longest arrow relative to this one
+HEAD_LENGTH, HEAD_ANGLE, ARROW_WIDTH = 7.5, 0.42, 2.2  # head and width in units of symbols; half of the head's angle (rad)
 NOT_UNIQUE_TINT = 0.5  # fraction of the background colour mixed into the colour of a force
-STUCK = 8.0, 3.5  # radius and width, in units of symbols, of the ring around a joint that sticks
-TOUCHING, TOUCHING_TINT = "touching", 0.5  # layer of links that touch; fraction of the background mixed into their colour
-SOLID = (MarkKind.LINK, MarkKind.DISC, MarkKind.WHEEL, MarkKind.OUTLINE, MarkKind.BLOCK)  # marks of the outlines of links
+STUCK_RING = 8.0, 3.5  # radius and width, in units of symbols, of the ring around a joint that sticks
+TOUCHING_LAYER, TOUCHING_TINT = "touching", 0.5  # layer of links that touch; fraction of the background mixed into their colour
+SOLID_MARKS = (MarkKind.LINK, MarkKind.DISC, MarkKind.WHEEL, MarkKind.OUTLINE, MarkKind.BLOCK)  # marks of the outlines of links
 PATH_WIDTH, PATH_TINT = 1.2, 0.4  # width in units of symbols; fraction of the background colour mixed into the colour of a body
 
 
@@ -110,10 +110,10 @@ def view_of(bounds: Sequence[float], width: int, times: int = 1, has_arrows: boo
     With `has_arrows` the margin has room for the arrow of the usual force.
     """
     left, bottom, right, top = bounds
-    margin = min(MARGIN + ARROW, 0.24 * width) if has_arrows else min(MARGIN, 0.12 * width)
+    margin = min(MARGIN + ARROW_LENGTH, 0.24 * width) if has_arrows else min(MARGIN, 0.12 * width)
     height = int(np.clip((width - 2 * margin) / (right - left) * (top - bottom) + 2 * margin, 0.25 * width, 1.25 * width))
     scale = times * min((width - 2 * margin) / (right - left), (height - 2 * margin) / (top - bottom))
-    pt = times * float(np.clip(min(width, height) / POINT, 0.75, 1.5))
+    pt = times * float(np.clip(min(width, height) / UNIT_PICTURE_SIDE, 0.75, 1.5))
     wide, high = times * width, times * height
     return View(scale, wide / 2 - scale * (left + right) / 2, high / 2 + scale * (bottom + top) / 2, wide, high, pt)
 
@@ -152,10 +152,10 @@ class Sketch:
         self.pose, self.view, self.theme = pose, view, THEMES[theme]
         symbols = symbols_of(marks, view.pt / view.scale)
         self.shapes: list[Line | Circle | Text] = [*map(self._path, paths), *map(self._shape, symbols)]
-        last = max((k for k, shape in enumerate(self.shapes) if shape.layer in SOLID), default=-1)
+        last = max((k for k, shape in enumerate(self.shapes) if shape.layer in SOLID_MARKS), default=-1)
         self.shapes[last + 1 : last + 1] = map(self._touching, touching)  # over the links, and below their pins
         for body, x, y in stuck:
-            ring = self.anchor(body, x, y), STUCK[0] * view.pt, STUCK[1] * view.pt, self.theme["force"]
+            ring = self.anchor(body, x, y), STUCK_RING[0] * view.pt, STUCK_RING[1] * view.pt, self.theme["force"]
             self.shapes.append(Circle("sticking", *ring))
         for arrow in arrows:
             self.shapes += self._arrow(arrow)
@@ -170,22 +170,22 @@ class Sketch:
         colour, radius = mix(self.theme["force"], self.theme["back"], TOUCHING_TINT), self.view.scale * part["radius"]
         places = np.array([self.anchor(part["body"], *point) for point in part["points"]])
         if len(places) == 1:
-            return Circle(TOUCHING, places[0], radius, fill=colour)
+            return Circle(TOUCHING_LAYER, places[0], radius, fill=colour)
         is_area = len(places) > 2
-        return Line(TOUCHING, places, 2 * radius, colour, colour if is_area else "", closed=is_area)
+        return Line(TOUCHING_LAYER, places, 2 * radius, colour, colour if is_area else "", closed=is_area)
 
     def _arrow(self, arrow: ForceArrow) -> list[Line]:
         """Return the shaft and the head of an arrow; [] if it is too short to be seen."""
         force, pt = np.array(arrow.force), self.view.pt
         size = float(np.hypot(*force))
-        length = ARROW * pt * min(size, LONGEST_ARROW)
-        if length <= HEAD * pt:
+        length = ARROW_LENGTH * pt * min(size, LONGEST_ARROW)
+        if length <= HEAD_LENGTH * pt:
             return []
         direction, start = force / size * [1, -1], self.anchor(arrow.body, *arrow.at)
         tip, side = start + length * direction, np.array([-direction[1], direction[0]])
-        back = tip - HEAD * pt * np.cos(HEAD_ANGLE) * direction
+        back = tip - HEAD_LENGTH * pt * np.cos(HEAD_ANGLE) * direction
         colour = mix(self.theme["force"], self.theme["back"], 0.0 if arrow.unique else NOT_UNIQUE_TINT)
-        wing = HEAD * pt * np.sin(HEAD_ANGLE) * side
+        wing = HEAD_LENGTH * pt * np.sin(HEAD_ANGLE) * side
         shaft = Line("reaction", np.array([start, back]), ARROW_WIDTH * pt, colour)
         return [shaft, Line("reaction", np.array([tip, back + wing, back - wing]), fill=colour, closed=True)]
 

@@ -18,7 +18,7 @@ from udkjax.show.player.marks.mark_kinds import MarkKind
 from udkjax.show.player.marks.marks import Mark
 
 Symbol = Mark
-ROUND = 48  # vertices of a circle drawn as a polyline
+CIRCLE_VERTICES = 48  # vertices of a circle drawn as a polyline
 COIL_LENGTH = 11.0  # units per coil of a spring of usual length
 FEWEST_TEETH, MOST_TEETH = 4, 400  # of a wheel: others have as many as fit its size
 STRAIGHT_END, LARGEST_PART = 10.0, 0.15  # straight ends of a spring in units; their largest fraction of its length
@@ -214,7 +214,7 @@ def _piston(mark: Mark, unit: float) -> Iterator[Symbol]:
 def _turn(mark: Mark, radius: float, sign: int) -> Iterator[Symbol]:
     """Draw a circular arrow; sign 1 is anticlockwise."""
     frame, flip = _at(mark, turns=False), np.array([1, sign])
-    line, direction = radius * _round(np.linspace(-0.5, 3.5, ROUND)), np.array([-np.sin(3.5), np.cos(3.5)])
+    line, direction = radius * _round(np.linspace(-0.5, 3.5, CIRCLE_VERTICES)), np.array([-np.sin(3.5), np.cos(3.5)])
     yield _line(frame, _offsets(flip * line), "accent", 1.8)
     yield _head(frame, flip * (line[-1] + 4 * direction), flip * direction)
 

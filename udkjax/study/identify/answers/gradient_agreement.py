@@ -12,10 +12,10 @@ from udkjax.study.differences import best_steps
 from udkjax.study.identify.problem.prediction import TolerancePair
 from udkjax.wording import join_names
 
-AGREEMENT = 3.0  # largest discrepancy, in floors, that is agreement; the parts of a floor are single samples of errors
+AGREEMENT_RATIO = 3.0  # largest discrepancy, in floors, that is agreement; the parts of a floor are single samples of errors
 # Steps with floors up to this factor above the smallest are used as well. Truncation is estimated from the next finer step, whose
 # noise is four times as large, so smaller truncation errors are unknown.
-ALIKE = 4.5
+SIMILAR_FLOOR_RATIO = 4.5
 USEFUL_PRECISION = 0.1  # largest floor, relative to the derivative, at which agreement is meaningful
 
 
@@ -76,8 +76,8 @@ class GradientCheck:
 
     @property
     def agrees(self) -> Bool[np.ndarray, "D S"]:
-        """Mask of the directions and series in which the discrepancy is at most `AGREEMENT` times the floor."""
-        return self.ratio <= AGREEMENT
+        """Mask of the directions and series in which the discrepancy is at most `AGREEMENT_RATIO` times the floor."""
+        return self.ratio <= AGREEMENT_RATIO
 
     @cached_property
     def best(self) -> Int[np.ndarray, "D S"]:
@@ -106,7 +106,7 @@ class GradientCheck:
         A derivative that is wrong is wrong at all of these steps, while a difference may be off at one of them.
         """
         floors = self.noise + self.truncation + self.derivative_error[..., None]
-        alike = floors <= ALIKE * self.floor[..., None]
+        alike = floors <= SIMILAR_FLOOR_RATIO * self.floor[..., None]
         ratios = np.where(self.discrepancy == 0.0, 0.0, self.discrepancy / np.where(floors == 0.0, np.finfo(float).tiny, floors))
         least = np.min(np.where(alike & ~np.isnan(ratios), ratios, np.inf), -1)
         return np.where(np.isinf(least), self.at_best(ratios), least)

@@ -21,14 +21,15 @@ from udkjax.study.identify.records.records import IdentificationError
 from udkjax.study.noise import NOISE_FLOOR
 from udkjax.wording import join_names
 
-DRAWS = 1023  # number of importance weights
+IMPORTANCE_DRAWS = 1023  # number of importance weights
 # A quarter of the weights, with the center, is tried first. From these, k has a standard deviation of 0.2 from seed to seed, and
 # errors relative to the largest ones that are trusted have one of 0.25.
-QUARTER, CLEAR = 255, 0.4
+QUARTER_OF_DRAWS, CLEAR_MARGIN = 255, 0.4
 # Largest error of a mean, in standard deviations, and of a standard deviation, as a factor; 95 % intervals then cover 87 %.
 MOST_SHIFT, MOST_RATIO = 0.25, 1.25
-TRUSTED_EXPONENT = 1.0 - 1.0 / np.log10(DRAWS)  # largest k with which so many importance weights have a reliable mean
-STEPS, HALVINGS, STANDING = 40, 12, 1e-6  # of Newton's method: largest numbers, and the step in standard deviations at its end
+TRUSTED_EXPONENT = 1.0 - 1.0 / np.log10(IMPORTANCE_DRAWS)  # largest k with which so many importance weights have a reliable mean
+# Of Newton's method: largest numbers, and the step in standard deviations at its end.
+NEWTON_STEPS, HALVINGS, LAST_STEP = 40, 12, 1e-6
 FARTHEST_STEP = 2.0  # largest step of an unknown, which is dimensionless: a factor of 7 for a positive number
 VISIBLE_PART = 0.1  # component of an undetermined direction, relative to the largest, from which an unknown is named
 
@@ -116,9 +117,9 @@ def approximate(problem: InferenceProblem, x: Float[np.ndarray, "K"], seed: int 
     """
     x = np.asarray(x, float)
     value, gradient, curvature = expand(problem, x)
-    for _ in range(STEPS):
+    for _ in range(NEWTON_STEPS):
         step, size = _newton_step(gradient, curvature)
-        if size <= STANDING:
+        if size <= LAST_STEP:
             break
         step *= min(1.0, FARTHEST_STEP / np.abs(step).max())
         for halving in range(HALVINGS):
@@ -143,11 +144,11 @@ def weigh(
         IdentificationError: the density is zero at the center, or everywhere around it.
     """
     K, log_det = len(x), np.linalg.slogdet(root)[1]
-    normal = np.random.default_rng(int(seed)).standard_normal((DRAWS, K))
+    normal = np.random.default_rng(int(seed)).standard_normal((IMPORTANCE_DRAWS, K))
     trials = x + normal @ root.T
     constant = 0.5 * K * np.log(2.0 * np.pi) + log_det
     points, densities = np.concatenate([x[None], trials]), np.zeros(0)
-    for part in np.split(points, len(points) // (QUARTER + 1)):  # equal parts share a compiled function
+    for part in np.split(points, len(points) // (QUARTER_OF_DRAWS + 1)):  # equal parts share a compiled function
         densities = np.append(densities, problem.log_densities(part))
         count, positive = len(densities) - 1, np.isfinite(densities)
         if not positive[0] or not positive[1:].any():
@@ -157,7 +158,7 @@ def weigh(
         weights = densities[1:] + 0.5 * np.sum(normal[:count] ** 2, 1) + constant
         k, (shift, ratio) = pareto_exponent(weights), _errors(normal[:count] @ root.T, weights, root)
         worst = max(shift / MOST_SHIFT, np.log(ratio) / np.log(MOST_RATIO))
-        if quick and abs(k - TRUSTED_EXPONENT) > CLEAR and abs(worst - 1.0) > CLEAR:
+        if quick and abs(k - TRUSTED_EXPONENT) > CLEAR_MARGIN and abs(worst - 1.0) > CLEAR_MARGIN:
             break
     top = weights.max()
     ratios = np.exp(weights - top)

@@ -34,8 +34,10 @@ from udkjax.study.noise import NOISE_FLOOR
 # Largest number of steps of a run, relative to those at the start. With numbers far from the start, such as masses times 1e13, a
 # run could take minutes, and all other chains of a batch would wait for it.
 MOST_STEPS = 20
-BATCH = 16  # runs of a batch whose outputs stay in the processor's cache: 1,024 four-bars with 500 outputs take half the time
-PART = 8 * BATCH  # runs of a thread: of a quarter of the weights of a normal approximation, two threads have one part each
+# Runs of a batch whose outputs stay in the processor's cache: 1,024 four-bars with 500 outputs take half the time.
+BATCH_RUNS = 16
+# Runs of a thread: of a quarter of the weights of a normal approximation, two threads have one part each.
+THREAD_RUNS = 8 * BATCH_RUNS
 
 
 class InferenceProblem:
@@ -200,16 +202,16 @@ class InferenceProblem:
 
         def densities(problem: "InferenceProblem", x: Array) -> Array:
             each = jax.vmap(problem.log_density)
-            if len(x) <= BATCH:
+            if len(x) <= BATCH_RUNS:
                 return each(x)
-            batches = jnp.pad(x, ((0, -len(x) % BATCH), (0, 0)), mode="edge").reshape(-1, BATCH, x.shape[1])
+            batches = jnp.pad(x, ((0, -len(x) % BATCH_RUNS), (0, 0)), mode="edge").reshape(-1, BATCH_RUNS, x.shape[1])
             return jax.lax.map(each, batches).reshape(-1)[: len(x)]
 
         compiled = self.compiled("densities", densities)
-        if is_traced(x) or np.shape(x)[0] <= PART:
+        if is_traced(x) or np.shape(x)[0] <= THREAD_RUNS:
             return compiled(x)
         points = np.asarray(x, float)
-        parts = np.pad(points, ((0, -len(points) % PART), (0, 0)), mode="edge").reshape(-1, PART, points.shape[1])
+        parts = np.pad(points, ((0, -len(points) % THREAD_RUNS), (0, 0)), mode="edge").reshape(-1, THREAD_RUNS, points.shape[1])
         each = member_threads().map(lambda part: np.asarray(compiled(part)), parts)
         return jnp.asarray(np.concatenate(list(each))[: len(points)])
 

@@ -43,7 +43,7 @@ from udkjax.wording import suggestion
 STILL_DEVIATION = 1e-12  # standard deviation below which a channel is constant, relative to its largest number
 RESIDUALS_PER_UNKNOWN = 3.0  # least number in the first fitted part of a record, and in a piece; fewer would fit the noise
 # Arguments of `simulate` that `identify` sets itself.
-DECIDED = ("ts", "mechanism", "state", "rtol", "atol", "adjoint", "throw", "progress", "analysis")
+OWN_ARGUMENTS = ("ts", "mechanism", "state", "rtol", "atol", "adjoint", "throw", "progress", "analysis")
 Strategy = Literal["auto", "pieces"]
 
 
@@ -350,7 +350,7 @@ def _with_initial_state(records: Sequence[Record], given: Start | Estimated | No
 
 
 def _check_settings(mechanism: StudyModel, settings: Mapping[str, Any]) -> None:
-    allowed = [name for name in inspect.signature(simulate).parameters if name not in DECIDED]
+    allowed = [name for name in inspect.signature(simulate).parameters if name not in OWN_ARGUMENTS]
     problems = [
         f"{name}: not an argument of simulate that can be given here{suggestion(name, allowed)}"
         for name in settings

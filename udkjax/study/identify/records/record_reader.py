@@ -12,7 +12,7 @@ from udkjax.annotations import Numbers
 from udkjax.positions.assembling.channels import Channel, Quantity, channel_of
 from udkjax.scene.numbers.units import conversion_factor
 from udkjax.study.identify.records.records import ByChannel, ChannelKey, IdentificationError, Noise, Record, key_of
-from udkjax.study.identify.records.tables import NOISE, RECORD, TIME, Table, TableData, read_tables
+from udkjax.study.identify.records.tables import NOISE_SUFFIX, RECORD_HEADING, TIME_HEADINGS, Table, TableData, read_tables
 from udkjax.study.quantities import StudyModel
 from udkjax.wording import abbreviate, quote, suggestion
 
@@ -79,15 +79,15 @@ class _TableReader:
     def records(self) -> Iterator[Record]:
         """Iterate over the records of the table; there are none once a mistake was found."""
         before = len(self.problems)
-        time = next((name for name in TIME if name in self.columns), None)
+        time = next((name for name in TIME_HEADINGS if name in self.columns), None)
         if time is None:
             if self.table.columns:
-                near = suggestion(TIME[0], self.columns)
-                self.problems.append(f"{self.table.source}: there is no column {quote(TIME[0])}{near}")
+                near = suggestion(TIME_HEADINGS[0], self.columns)
+                self.problems.append(f"{self.table.source}: there is no column {quote(TIME_HEADINGS[0])}{near}")
             return
         times = self.numbers(time, "s")
         numbers = len(self.problems) == before
-        values, noise = self.channels([name for name in self.columns if name not in (time, RECORD)])
+        values, noise = self.channels([name for name in self.columns if name not in (time, RECORD_HEADING)])
         for label, places in self.rows_by_record():
             if numbers:
                 self.check_times(time, times, places)
@@ -98,7 +98,7 @@ class _TableReader:
         """Return the values of each channel, and the standard deviations of channels with a column for these."""
         found: dict[ChannelKey, tuple[str, str]] = {}  # headings and units
         for heading in headings:
-            of = heading.removesuffix(NOISE)
+            of = heading.removesuffix(NOISE_SUFFIX)
             if of != heading:
                 if of not in (*headings, *self.ignore):
                     self.add(heading, f"there is no column {quote(of)}")
@@ -113,8 +113,10 @@ class _TableReader:
             else:
                 found[key] = heading, channel.units
         values = {key: self.numbers(heading, units) for key, (heading, units) in found.items()}
-        with_noise = {key: (h, units) for key, (h, units) in found.items() if h + NOISE in self.columns}
-        return values, {key: self.numbers(h + NOISE, units, self.columns[h].units) for key, (h, units) in with_noise.items()}
+        with_noise = {key: (h, units) for key, (h, units) in found.items() if h + NOISE_SUFFIX in self.columns}
+        return values, {
+            key: self.numbers(h + NOISE_SUFFIX, units, self.columns[h].units) for key, (h, units) in with_noise.items()
+        }
 
     def numbers(self, heading: str, wanted: str, units: str | None = None) -> np.ndarray:
         """Return the numbers of a column in the units `wanted`; gaps are NaN.
@@ -138,10 +140,10 @@ class _TableReader:
 
     def rows_by_record(self) -> list[tuple[str, np.ndarray]]:
         """Return the names of the records, each with the indices of its rows."""
-        if RECORD not in self.columns:
+        if RECORD_HEADING not in self.columns:
             return [(self.table.name, np.arange(len(self.table.rows)))]
-        labels = [_label(cell) for cell in self.columns[RECORD].values]
-        self.add_each(RECORD, [k for k, label in enumerate(labels) if not label], lambda k: "is empty")
+        labels = [_label(cell) for cell in self.columns[RECORD_HEADING].values]
+        self.add_each(RECORD_HEADING, [k for k, label in enumerate(labels) if not label], lambda k: "is empty")
         return [(label, np.flatnonzero(np.array(labels) == label)) for label in dict.fromkeys(labels)]
 
     def check_times(self, time: str, times: np.ndarray, places: np.ndarray) -> None:

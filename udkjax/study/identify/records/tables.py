@@ -24,10 +24,11 @@ if TYPE_CHECKING:  # imported only if their tables are given
     import xarray
 
 TableData: TypeAlias = "ByChannel[Numbers] | pandas.DataFrame | xarray.Dataset | str | os.PathLike[str]"
-TIME, RECORD, NOISE = ("time", "t"), "record", ".noise"  # headings of times and record names, and the suffix of a channel's noise
+# Headings of times and record names, and the suffix of a channel's noise.
+TIME_HEADINGS, RECORD_HEADING, NOISE_SUFFIX = ("time", "t"), "record", ".noise"
 _DELIMITERS = (";", "\t", ",")
 # Coordinates in files written by `Solution.to_xarray`, as channels of bodies.
-_STATES = {"q": dict(zip(COORDINATES, COORDINATES, strict=True)), "v": dict(zip(COORDINATES, RATES, strict=True))}
+_STATE_CHANNELS = {"q": dict(zip(COORDINATES, COORDINATES, strict=True)), "v": dict(zip(COORDINATES, RATES, strict=True))}
 
 
 class TableColumn(NamedTuple):
@@ -122,7 +123,7 @@ def _join_points(cells: Sequence[str], delimiter: str) -> list[str]:
 
 def _table_of_frame(data: "pandas.DataFrame", source: str, problems: list[str]) -> Table:
     """Return the table of a pandas DataFrame; the index is a column if its name is that of a time or a record."""
-    indexed = data.index.name is not None and _heading(str(data.index.name))[0] in (*TIME, RECORD)
+    indexed = data.index.name is not None and _heading(str(data.index.name))[0] in (*TIME_HEADINGS, RECORD_HEADING)
     columns = [data.index.to_series()] if indexed else []
     columns += [data.iloc[:, k] for k in range(data.shape[1])]
     values = [x.to_numpy(float, na_value=np.nan) if x.dtype.kind in "iuf" else x.to_numpy() for x in columns]
@@ -163,26 +164,26 @@ def _read_dataset(
     data: "xarray.Dataset", bodies: Sequence[str], source: str, problems: list[str], name: str = ""
 ) -> Iterator[Table]:
     """Iterate over the tables of an xarray Dataset, one per record."""
-    if RECORD not in data.dims:
+    if RECORD_HEADING not in data.dims:
         yield _read_record(data, bodies, source, problems, name)
         return
-    for k in range(data.sizes[RECORD]):
-        label = str(data[RECORD].values[k]) if RECORD in data.coords else str(k)
+    for k in range(data.sizes[RECORD_HEADING]):
+        label = str(data[RECORD_HEADING].values[k]) if RECORD_HEADING in data.coords else str(k)
         found: list[str] = []
-        record = data.isel({RECORD: k}).drop_vars(RECORD, errors="ignore")
+        record = data.isel({RECORD_HEADING: k}).drop_vars(RECORD_HEADING, errors="ignore")
         yield _read_record(record, bodies, source, found, label)._replace(padded=True)
         problems += [problem for problem in found if problem not in problems]
 
 
 def _read_record(data: "xarray.Dataset", bodies: Sequence[str], source: str, problems: list[str], name: str) -> Table:
-    time = next((t for t in TIME if t in data.variables and data[t].ndim == 1), None)
+    time = next((t for t in TIME_HEADINGS if t in data.variables and data[t].ndim == 1), None)
     if time is None:
-        problems.append(f"{source}: there is no coordinate {quote(TIME[0])}")
+        problems.append(f"{source}: there is no coordinate {quote(TIME_HEADINGS[0])}")
         return Table(source, {}, [], name)
     dims, count = data[time].dims, data[time].size
     columns = {time: TableColumn(data[time].values, data[time].attrs.get("units"))}
     for key, variable in data.data_vars.items():
-        if key in _STATES and set(variable.dims) == {*dims, "body", "coordinate"}:
+        if key in _STATE_CHANNELS and set(variable.dims) == {*dims, "body", "coordinate"}:
             columns |= _state_columns(str(key), variable.transpose(*dims, "body", "coordinate"), bodies, source, problems)
         elif variable.dims in ((), dims):
             columns[str(key)] = TableColumn(np.broadcast_to(variable.values, count), variable.attrs.get("units"))
@@ -203,5 +204,5 @@ def _state_columns(
             problems.append(f"{source}, {quote(key)}: no body named {quote(body)}{suggestion(body, bodies)}")
             continue
         for k, coordinate in enumerate(map(str, values["coordinate"].values)):
-            columns[f"body.{body}.{_STATES[key].get(coordinate, coordinate)}"] = TableColumn(values.values[:, i, k], None)
+            columns[f"body.{body}.{_STATE_CHANNELS[key].get(coordinate, coordinate)}"] = TableColumn(values.values[:, i, k], None)
     return columns

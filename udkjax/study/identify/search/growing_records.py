@@ -24,7 +24,7 @@ from udkjax.study.identify.problem.fit_problem import RESIDUALS_PER_UNKNOWN, Fit
 from udkjax.study.identify.problem.prediction import TolerancePair
 from udkjax.study.identify.problem.residuals import Reduction, Residuals
 from udkjax.study.identify.problem.unknowns import Unknowns
-from udkjax.study.identify.search.least_squares import COARSE_STEP, FEW_STEPS, LOOSE_STEP, STEPS, CostHistory, Fit
+from udkjax.study.identify.search.least_squares import COARSE_STEP, FEW_STEPS, FINAL_STEPS, LOOSE_STEP, CostHistory, Fit
 from udkjax.study.identify.search.optimizer import Minimizer, huber, robust
 from udkjax.study.noise import noise_of_differences
 
@@ -112,7 +112,7 @@ def fit_growing_records(
                 if np.abs(unknowns - beginning).max() <= SAME_BEGINNING_DISTANCE:
                     return same._replace(history=history)
         fitted, size, ahead = ahead, rms, 0.0
-    fit = minimizer.with_label("whole records").minimize(problem, unknowns, tol, None, STEPS, LOOSE_STEP)
+    fit = minimizer.with_label("whole records").minimize(problem, unknowns, tol, None, FINAL_STEPS, LOOSE_STEP)
     if earlier is not None:
         earlier.append((begun, fit))
     return fit._replace(history=history + fit.history)

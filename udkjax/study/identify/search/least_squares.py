@@ -23,7 +23,7 @@ from udkjax.study.identify.problem.unknowns import FARTHEST_UNKNOWN, INVISIBLE_R
 COARSE_STEP, LOOSE_STEP, FINE_STEP, EXACT_STEP = 1e-3, 1e-5, 1e-6, 1e-10
 # Maximum number of steps: for a part of the records, or near a minimum; from a first guess, which is given up if it has not
 # converged by then; and for the final fit.
-FEW_STEPS, SOME_STEPS, STEPS = 15, 30, 60
+FEW_STEPS, SOME_STEPS, FINAL_STEPS = 15, 30, 60
 # Cosine of the angle between the residuals and the range of J at which a fit has converged. Multiplied by the square root of the
 # number of residuals, it is the Gauss-Newton step in standard errors, of which a thousandth is negligible.
 ORTHOGONAL_COSINE = 1e-5
@@ -49,7 +49,7 @@ class Fit(NamedTuple):
 def minimize_squares(
     evaluate: Objective,
     z: Float[np.ndarray, "K"],
-    steps: int = STEPS,
+    steps: int = FINAL_STEPS,
     step_tol: float = EXACT_STEP,
     report: ReportStep = lambda text: None,
     stuck: Stuck | None = None,

@@ -20,8 +20,8 @@ from udkjax.study.identify.problem.unknowns import INVISIBLE_RATIO, Unknowns
 from udkjax.study.identify.records.records import IdentificationError
 from udkjax.study.identify.search.least_squares import (
     EXACT_STEP,
+    FINAL_STEPS,
     FINE_STEP,
-    STEPS,
     Descent,
     Fit,
     Objective,
@@ -94,9 +94,9 @@ def named_loss(name: str, residuals: int) -> Loss:
     """
     if name == "least_squares":
         return squares
-    if name in ROBUST:
-        return partial(robust, rho=ROBUST[name], residuals=residuals)
-    raise IdentificationError([f"loss must be 'least_squares', {' or '.join(map(repr, ROBUST))}, not {name!r}"])
+    if name in ROBUST_LOSSES:
+        return partial(robust, rho=ROBUST_LOSSES[name], residuals=residuals)
+    raise IdentificationError([f"loss must be 'least_squares', {' or '.join(map(repr, ROBUST_LOSSES))}, not {name!r}"])
 
 
 def robust(plain: Residuals, rho: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]], residuals: int) -> Residuals:
@@ -136,7 +136,7 @@ def soft_l1(size: np.ndarray, c: float = TUNING_CONSTANT) -> tuple[np.ndarray, n
     return 2.0 * size**2 / (root + 1.0), size / root
 
 
-ROBUST = {"huber": huber, "soft_l1": soft_l1}
+ROBUST_LOSSES = {"huber": huber, "soft_l1": soft_l1}
 
 
 # --- fits
@@ -180,7 +180,7 @@ class Minimizer:
         z: Float[np.ndarray, "K"],
         tol: TolerancePair,
         horizon: float | None = None,
-        steps: int = STEPS,
+        steps: int = FINAL_STEPS,
         step_tol: float = EXACT_STEP,
     ) -> Fit:
         """Fit the first `horizon` seconds of each record (None: the whole record) from a first guess: see `minimize_squares`."""

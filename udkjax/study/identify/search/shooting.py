@@ -29,9 +29,9 @@ from udkjax.study.identify.problem.unknowns import apply_values, with_conditions
 from udkjax.study.identify.search.least_squares import (
     COARSE_STEP,
     FEW_STEPS,
+    FINAL_STEPS,
     FINE_STEP,
     SOME_STEPS,
-    STEPS,
     Fit,
     Objective,
     minimize_squares,
@@ -44,7 +44,7 @@ MOST_PIECES = 60  # largest number of pieces of all records, since the linear al
 CONTINUED_PART = 1e-2
 LEAST_MOTION = 1e-3  # least motion of a coordinate in a piece, relative to the largest
 # w, with gaps relative to the motion of coordinates in a piece, and residuals relative to the scales of their channels.
-WEIGHTS = tuple(10.0**k for k in range(-2, 5))
+GAP_WEIGHTS = tuple(10.0**k for k in range(-2, 5))
 
 
 class Piece(NamedTuple):
@@ -72,7 +72,7 @@ class MultipleShooting(FitProblem):
         """Cut the records, and compute initial states of all pieces along them from the unknowns z of the whole problem."""
         super().__init__(whole.mechanism, whole.unknowns, whole.records, whole.settings)
         self.predictor = Predictor(whole.mechanism, whole.unknowns.targets, whole.channels, whole.settings, ends=True)
-        self.whole, self.weight = whole, WEIGHTS[0]
+        self.whole, self.weight = whole, GAP_WEIGHTS[0]
         first = whole.records[0]
         free = self._unknowns_at(0, whole.unknowns.guess, first.t0, first.start.state)
         n, self.S = free.basis.shape[1:]
@@ -208,13 +208,13 @@ def fit_pieces(
     """
     shooting = MultipleShooting(problem, z, tol, samples)
     fit, history = Fit(shooting.guess, np.inf, False, []), []
-    for weight in WEIGHTS:
+    for weight in GAP_WEIGHTS:
         shooting.weight = weight
         labelled = minimizer.with_label(f"pieces, weight of the gaps {weight:.0e}")
-        steps, step_tol = (STEPS, FINE_STEP) if weight == WEIGHTS[-1] else (SOME_STEPS, COARSE_STEP)
+        steps, step_tol = (FINAL_STEPS, FINE_STEP) if weight == GAP_WEIGHTS[-1] else (SOME_STEPS, COARSE_STEP)
         fit = labelled.minimize(shooting, fit.z, tol, None, steps, step_tol)
         history += fit.history
-        if weight > WEIGHTS[0] and not fit.converged:  # with larger weights, the fit would be even farther from a minimum
+        if weight > GAP_WEIGHTS[0] and not fit.converged:  # with larger weights, the fit would be even farther from a minimum
             break
     return shooting, fit._replace(history=history)
 
