@@ -33,7 +33,7 @@ _PREFIXES = tuple(f"{_PACKAGE.name}.{x.removesuffix('.py').replace('/', '.')}" f
 # Functions whose results may change.
 _CHANGING_FUNCTIONS = frozenset("fromfile fromregex genfromtxt load loadtxt memmap random".split())
 _WITHOUT_KEY = frozenset("__import__ breakpoint compile eval exec globals hash id input locals open vars".split())
-# By dataclasses; tracing does not use them.
+# Methods that dataclasses generate; tracing does not use them.
 _GENERATED_METHODS = frozenset("__eq__ __hash__ __init__ __replace__ __repr__".split())
 _Compiled = type(jax.jit(lambda: None))
 _PLAIN_TYPES = (type(None), bool, int, float, complex, str, bytes, type(...))

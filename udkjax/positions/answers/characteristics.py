@@ -21,7 +21,7 @@ from udkjax.scene.elements.joints import Cam, Prismatic, Revolute, Slot
 from udkjax.scene.mechanism import Mechanism
 
 SAME_SPEED_TOL = 1e-9  # relative to the fastest: speeds of mirrored positions, which rounding separates
-# Of the extremes of pressure angles: rounds, and values of each; a round divides the step by ten.
+# Rounds in which the extremes of pressure angles are refined, and values in each: a round divides the step by ten.
 REFINEMENTS, VALUES_PER_ROUND = 6, 21
 
 

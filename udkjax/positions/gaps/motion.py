@@ -21,7 +21,7 @@ from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.tables.checks import SceneError
 
 FIRST_POSES = 361  # of a drive: a degree apart over a turn
-# Of the mechanism's size: error of a polynomial halfway between poses, above which a pose is computed there.
+# Relative to the mechanism's size: a pose is added halfway between two where the polynomial has a larger error.
 POLYNOMIAL_TOL = 1e-11
 MOST_HALVINGS = 8
 PosesAndRates = Float[np.ndarray, "n 3 bodies 3"]  # positions of bodies and, last, of the ground, with two derivatives by u

@@ -13,7 +13,7 @@ from udkjax.scene.tables.checks import SceneError
 from udkjax.wording import join_names, quote, suggestion
 
 LinkPair = tuple[str, str]
-# Of the largest coordinate of a pin: two revolutes of a body nearer than this are at one place, up to rounding.
+# Relative to the largest coordinate of a pin: two revolutes of a body nearer than this are at one place, up to rounding.
 SAME_PIN_TOL = 1e-9
 
 

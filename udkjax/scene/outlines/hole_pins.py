@@ -10,7 +10,7 @@ from udkjax.scene.drawing.drawn_quantities import Units
 from udkjax.scene.outlines.outline import Outline, RoundHole
 from udkjax.wording import quote
 
-# Of a hole's radius: distance of a pin from its centre, and difference of diameters, up to which they are the same.
+# Relative to a hole's radius: a pin that is nearer to its centre, or a difference of diameters that is smaller, fits the hole.
 HOLE_TOL = 1e-3
 
 

@@ -21,7 +21,7 @@ from scipy.special import ndtri
 from udkjax.study.identify.density.log_density import InferenceProblem
 
 DRAWS_PER_CHUNK = 25  # number of draws in a chunk, between which tuning, storing and interruptions take place
-# Of trajectories for unit covariance, and the range of its random factor.
+# Length of trajectories for unit covariance, and the range of its random factor.
 TRAJECTORY_LENGTH, LENGTH_FACTORS = np.pi / 2, (0.6, 1.4)
 STEP_FACTORS = 0.8, 1.0  # range of the random factor of a step, which avoids periods of a trajectory that are multiples of it
 FIRST_STEP, LARGEST_STEP = 0.5, 1.5  # for unit covariance; leapfrog is unstable from 2

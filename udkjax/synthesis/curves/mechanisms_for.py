@@ -16,7 +16,7 @@ from udkjax.synthesis.curves.curve_search import FEWEST_BARS, CurveSearch
 from udkjax.synthesis.curves.descent import LinkageLimits
 from udkjax.synthesis.curves.targets import CHAMFER_POINTS, WantedCurve
 
-# Of a mechanism by default: largest distance of its pins from the middle of the curve, in extents of the curve.
+# Default of the largest distance of pins from the middle of the curve, in extents of the curve.
 DEFAULT_SIZE = 3.0
 DEFAULT_TRANSMISSION = float(np.deg2rad(8.0))  # smallest transmission angle by default
 SHORTEST_LENGTH = 0.02  # smallest distance of two joints of a dyad's link, in extents of the curve

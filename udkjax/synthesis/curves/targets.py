@@ -12,7 +12,7 @@ FEWEST_POINTS = 3  # points of a curve
 # Extent (m) of a curve, and one over the smallest: the fifth powers of both, in moments of inertia, are finite.
 LARGEST_EXTENT = 1e30
 CLOSED_GAP = 0.02  # a curve whose ends are nearer, relative to its length, is closed
-# So is one of at least so many points whose ends are nearer than their usual distance, times this.
+# A curve of at least MANY_POINTS is also closed if its ends are nearer than CLOSED_SPACING times the usual distance of points.
 CLOSED_SPACING, MANY_POINTS = 1.25, 12
 
 

@@ -28,7 +28,7 @@ QUARTER_OF_DRAWS, CLEAR_MARGIN = 255, 0.4
 # Largest error of a mean, in standard deviations, and of a standard deviation, as a factor; 95 % intervals then cover 87 %.
 MOST_SHIFT, MOST_RATIO = 0.25, 1.25
 TRUSTED_EXPONENT = 1.0 - 1.0 / np.log10(IMPORTANCE_DRAWS)  # largest k with which so many importance weights have a reliable mean
-# Of Newton's method: largest numbers, and the step in standard deviations at its end.
+# Most steps of Newton's method, most halvings of each, and the step (in standard deviations) that ends it.
 NEWTON_STEPS, HALVINGS, LAST_STEP = 40, 12, 1e-6
 FARTHEST_STEP = 2.0  # largest step of an unknown, which is dimensionless: a factor of 7 for a positive number
 VISIBLE_PART = 0.1  # component of an undetermined direction, relative to the largest, from which an unknown is named
