@@ -36,7 +36,8 @@ def multiplied(factor: float, *constants: str) -> Iterator[None]:
 
     Args:
         factor: The factor.
-        constants: Their names, such as `integrate.drift.DEPENDENT`, or `equations.run_programs.RunPrograms.STAGES` of a class.
+        constants: Their names, such as `integrate.drift.DEPENDENT_DISTANCE`; of a class,
+            `equations.run_programs.RunPrograms.STAGES`.
     """
     with pytest.MonkeyPatch.context() as patch:
         for path in constants:

@@ -187,12 +187,13 @@ LONG = {"jnp": "jax.numpy", "np": "numpy", "eqx": "equinox", "eqxi": "equinox.in
 
 @cache
 def identifiers() -> set[str]:
-    """Return all names in the package and its studies: of modules and of Python, keys of dictionaries and of scenes."""
+    """Return all names in the package, its studies and .ci/slow: of modules and of Python, keys of dictionaries, of scenes."""
     found = {*dir(builtins), "udk", "udkjax", "pytest", "Args", "Returns", "Raises", "Source"}
     for script in (ROOT / "udkjax/show/player").glob("*.js"):
         found |= set(re.findall(r"\w+", script.read_text()))
     tests = {
-        path: ast.parse(path.read_text()) for path in [ROOT / "tests" / "elements.py", *(ROOT / "tests").glob("*/methods.py")]
+        path: ast.parse(path.read_text())
+        for path in [ROOT / ".ci" / "slow", ROOT / "tests" / "elements.py", *(ROOT / "tests").glob("*/methods.py")]
     }
     for path, tree in (sources() | tests).items():
         found |= {path.stem, path.parent.name}

@@ -132,7 +132,7 @@ class LoadedCode:
         return host_handler.register(self.name, self._optimized.library["call_frame"])
 
     def code(self, level: int) -> Code:
-        """Return the code at a level of optimization, `machine.LEVEL` or `machine.QUICK`; its first use compiles it."""
+        """Return the code at a level, `machine.OPTIMIZATION_LEVEL` or `machine.QUICK_LEVEL`; its first use compiles it."""
         return self._optimized if level == machine.OPTIMIZATION_LEVEL else self._quick
 
     @cached_property
