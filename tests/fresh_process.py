@@ -1,13 +1,20 @@
 """Python in a process of its own, where nothing is imported and nothing is set."""
 
+import os
 import subprocess
 import sys
 from pathlib import Path
 
+from udkjax.native.code.processor import LANES_VARIABLE
+
 
 def python(code: str, **environment: object) -> str:
-    """Run code with few variables of the environment, and those given; return what it prints."""
-    clean = {"PATH": "/usr/bin:/bin", "JAX_PLATFORMS": "cpu", **{name: str(value) for name, value in environment.items()}}
+    """Run code with few variables of the environment, and those given; return what it prints.
+
+    Machine code has as many lanes as in this process, so that both compute the same bits.
+    """
+    lanes = {name: value for name, value in os.environ.items() if name == LANES_VARIABLE}
+    clean = {"PATH": "/usr/bin:/bin", "JAX_PLATFORMS": "cpu", **lanes, **{name: str(x) for name, x in environment.items()}}
     done = subprocess.run([sys.executable, "-c", code], env=clean, capture_output=True, text=True, check=False)
     assert done.returncode == 0 and "Traceback" not in done.stderr, done.stderr[-2000:]
     return done.stdout.strip()

@@ -48,7 +48,8 @@ def _calls_now(question):
 
     def listen(frame, event, argument):
         nonlocal count
-        count += event in ("call", "c_call")
+        is_inlined = event == "call" and frame.f_code.co_name in ("<listcomp>", "<setcomp>", "<dictcomp>")  # since Python 3.12
+        count += event in ("call", "c_call") and not is_inlined
 
     gc.disable()  # what is collected meanwhile calls functions, too: caches forget it
     sys.setprofile(listen)
