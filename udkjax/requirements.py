@@ -52,7 +52,7 @@ def array(name: str, value: Any) -> "np.ndarray | Tracer":
     """
     if isinstance(value, Tracer):
         numbers: Any = without_derivatives(value)
-        numbers = numbers if isinstance(numbers, Tracer) else np.asarray(numbers)  # derivatives of Python's numbers
+        numbers = numbers if isinstance(numbers, Tracer) else np.asarray(numbers)  # a Python number under grad
     elif not isinstance(value, np.ndarray | float) and is_traced(value):
         numbers = without_derivatives(jnp.asarray(value))  # a list of traced numbers
     else:

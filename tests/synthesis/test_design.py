@@ -9,6 +9,7 @@ import pytest
 import udkjax as udk
 from tests.choices import fast
 from udkjax.arrays import solve_each
+from udkjax.synthesis.design_problem import MARGIN_WEIGHT
 from udkjax.synthesis.search import loss_of
 from udkjax.synthesis.trials import Trials
 
@@ -242,6 +243,35 @@ def start_of(mechanism, driver):
     from udkjax.positions.following.drive import drive
 
     return float(drive(mechanism, driver).value(mechanism.q0))
+
+
+def test_the_limit_of_a_turn_is_at_its_least_transmission():
+    """The row of the limit and its derivatives are those of the minimum of a turn in fine steps, for 20 crank-rockers."""
+    crank_rocker = udk.Drawing(
+        pins={"O": (0, 0), "A": (0.3, 2), "B": (7, 6), "P": (6, 12), "C": (9, 0)},
+        links={"crank": {"pins": ["O", "A"], "mass": 1.0}, "coupler": {"pins": ["A", "B", "P"], "mass": 1.0}}
+        | {"rocker": {"pins": ["C", "B"], "mass": 1.0}},
+        ground=["O", "C"],
+        motors={"motor": {"pin": "O", "speed": 1.0}},
+    )
+    problem = udk.DesignSearch(crank_rocker, udk.PathGoal("P", [[6, 12], [4, 10], [2, 8]])).problem
+    start, pins_only = np.zeros(problem.unknowns), np.arange(problem.unknowns) < problem.free.count
+    start[pins_only] = problem.free.vector
+    x = start + 0.02 * problem.scale * np.random.default_rng(0).standard_normal((20, problem.unknowns)) * pins_only
+
+    def least(x):  # tau^2, the minimum of a parabola in a turn of 2,000 steps
+        square = problem.turn(x, 2000).transmission[:, :-1] ** 2
+        worst = square.argmin(1)
+        before, lowest, after = (square[np.arange(len(x)), (worst + k) % square.shape[1]] for k in (-1, 0, 1))
+        return lowest - (before - after) ** 2 / (8 * (before - 2 * lowest + after))
+
+    unit = MARGIN_WEIGHT * problem.scale
+    limit, slopes, turns = problem._turn_limit(x, np.zeros(20), None)
+    assert turns.all()
+    np.testing.assert_allclose(-limit[:, 0] / unit, least(x), atol=1e-8)
+    h = 1e-5 * problem.scale
+    by_x = [(least(x + h * to) - least(x - h * to)) / (2 * h) for to in np.eye(problem.unknowns)[pins_only]]
+    np.testing.assert_allclose(-slopes[:, 0, pins_only] / unit, np.transpose(by_x), atol=3e-6)
 
 
 def test_a_free_start_of_given_values_is_an_unknown():

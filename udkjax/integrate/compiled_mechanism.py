@@ -172,7 +172,7 @@ def _is_piecewise(system: Any) -> bool:
 
 @cached_by_identity
 def compile_concrete(system: Any, *choices: Any) -> CompiledMechanism:
-    """Return a system of concrete numbers, compiled, with NumPy arrays, since JAX would compile a program for each operation.
+    """Return a compiled system of concrete numbers, whose arrays are NumPy's: with JAX's, each operation would compile a program.
 
     The `choices` are the arguments of `compile_mechanism` after the system.
     """

@@ -201,8 +201,9 @@ def scene_inputs(equations: AbstractSystem, mechanism: Mechanism, policy: RankPo
 
     Args:
         equations: the equations.
-        mechanism: the mechanism whose numbers are the inputs, with one row instead of samples, or at a given time.
-        policy: the policy for rows of deficient rank, on which one of the thresholds of pivots depends.
+        mechanism: the mechanism whose numbers are the inputs. Instead of samples it has one row for each sampled quantity, of
+            zeros (`stand_in`) or of the values at a time (`Mechanism.at`).
+        policy: the policy for rows of deficient rank, from which the first of the two pivot thresholds follows.
         xp: jax.numpy, or NumPy if all numbers are concrete.
     """
     textbook = equations.textbook

@@ -48,8 +48,8 @@ def _call_of_rows(
     """Return the outputs of members with the same redundant rows; `is_shared` is the mask of these rows."""
     rows = tuple(np.flatnonzero(is_shared).tolist())
     with computing_on_host():  # programs are traced here, while a graphics card may wait
-        own = replace(operation, code=operation.code.with_shared_rows(rows))
-    return call(*(_with_weights(inputs, operation, len(rows)) if rows else inputs), operation=own, times=times)
+        with_rows = replace(operation, code=operation.code.with_shared_rows(rows))
+    return call(*(_with_weights(inputs, operation, len(rows)) if rows else inputs), operation=with_rows, times=times)
 
 
 @dataclass(frozen=True)

@@ -343,7 +343,7 @@ class DesignProblem:
     def _turn_limit(self, x: np.ndarray, margin: np.ndarray, threads: int | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the limit row of the least transmission of a turn, its derivative, and a mask of the trials that turn fully.
 
-        The minimum of tau^2 is that of a parabola through three values of the turn, corrected once by the slope there.
+        The minimum of tau^2 is that of a parabola through three values of the turn, then corrected by one Newton step.
         """
         turn = self.turn(x, CHECK_VALUES, threads)
         turns, all_of_them = turn.reached.all(1), np.arange(len(x))
@@ -358,7 +358,7 @@ class DesignProblem:
             solved = code(x, s[:, None], self._unit, None, guess, threads=threads)
             value, slope = solved.out[:, 0, columns.value], solved.out[:, 0, columns.by_value]
             if not last:
-                moved = s - np.where(np.isfinite(slope), value * slope, 0.0) * step**2 / bend
+                moved = s - np.where(np.isfinite(slope), 2.0 * value * slope, 0.0) * step**2 / bend
                 s, guess = np.clip(moved, centre - step, centre + step), np.where(np.isfinite(solved.q), solved.q, guess)
         turns &= np.isfinite(solved.end[:, 0])
         unit, by_x = MARGIN_WEIGHT * self.scale, solved.out[:, 0, columns.by_parameters]

@@ -189,16 +189,16 @@ class LoadSharing:
         terms, n = self.terms, self.terms.layout.coordinate_count
         yield Reset("moved_null", 0, terms.layout.sizes["moved_null"])
         for _ in range(corrections):
-            for j, (own, i, row) in enumerate(self._places):
+            for j, (shared, i, row) in enumerate(self._places):
                 yield Reset("null_jt", j * n, n)
 
-                def add_row(w: KernelWriter, group: ConstraintGroup = own, row: int = row, j: int = j):
+                def add_row(w: KernelWriter, group: ConstraintGroup = shared, row: int = row, j: int = j):
                     for c, s in enumerate(_state_entries(group, row)):
                         if not s.is_zero:
                             w.write(s, "null_jt", BODIES + 3 * (c // 3) + BODY_COORDINATES, j * n + c % 3, ADD)
 
-                loop = terms.over_group(("row of null", row, j), own, add_row)
-                yield loop._replace(table=own.table[i : i + 1])
+                loop = terms.over_group(("row of null", row, j), shared, add_row)
+                yield loop._replace(table=shared.table[i : i + 1])  # of this constraint alone
                 for group in terms.layout.eliminated:
 
                     def add_rows(w: KernelWriter, group: ConstraintGroup = group, j: int = j):

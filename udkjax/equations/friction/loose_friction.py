@@ -50,10 +50,10 @@ def loose_friction(mechanism: Mechanism, t: Time, q: Vector, N: Float[Array, "m 
     random, unit = np.random.default_rng(0), jnp.asarray(scales.coordinates(q.size))
     some_load, some_mix = (jnp.asarray(random.normal(size=size)) for size in N.shape)
     rate = jnp.where(jnp.asarray(scales.rate) > 0, scales.rate, 1.0)  # without loads and velocities, there is no time
-    everywhere = jnp.asarray(random.normal(size=q.size)) * unit * rate  # all joints slide
+    sliding = jnp.asarray(random.normal(size=q.size)) * unit * rate  # velocities at which all joints slide
     D, root = uk.D(mechanism, t, q, scales.weights), uk.inverse_sqrt_mass(mechanism)
     plus = _inverse_of_rank(D, len(D) - N.shape[1])  # of the rank that N has, near a singular configuration, too
-    v = everywhere - root * (plus @ (D @ (everywhere / root)))
+    v = sliding - root * (plus @ (D @ (sliding / root)))
 
     def frictions(speeds: Array, multipliers: Array) -> Array:
         """Return the loads of friction of each joint (j, n) in N m: forces are multiplied by L."""
@@ -63,15 +63,15 @@ def loose_friction(mechanism: Mechanism, t: Time, q: Vector, N: Float[Array, "m 
     def sizes(speeds: Array, multipliers: Array) -> Array:
         return jnp.linalg.norm(frictions(speeds, multipliers), axis=1)
 
-    usual = sizes(everywhere, some_load)
-    loose = sizes(everywhere, N @ some_mix) > UNIQUE_TOL * usual
+    usual = sizes(sliding, some_load)
+    loose = sizes(sliding, N @ some_mix) > UNIQUE_TOL * usual
     drags = frictions(v, some_load)
     slides = jnp.linalg.norm(drags, axis=1) > UNIQUE_TOL * usual
 
     def response(drag: Array) -> Array:
         """Return the size of each joint's friction (j,) that the reactions to a load `drag` (n,) cause, if all joints slide."""
         multipliers = uk.weigh(scales.weights, plus.T @ (plus @ (D @ (root * (drag / unit)))))
-        return sizes(everywhere, multipliers * jnp.asarray(scales.rows))
+        return sizes(sliding, multipliers * jnp.asarray(scales.rows))
 
     answers = jax.vmap(response)(drags / jnp.where(slides, jnp.linalg.norm(drags, axis=1), jnp.inf)[:, None])
     return LooseFriction(loose, slides, answers > UNIQUE_TOL * usual)

@@ -78,7 +78,10 @@ class DifferentiablePrograms:
         return self._programs[outputs]
 
     def _projection(self) -> DifferentiableProgram:
-        """Return the program that computes q1 and v1 of a state on the manifold, where they equal q and v."""
+        """Return the program of the projection, q1 and v1, whose derivatives are right to second order.
+
+        Its state is on the manifold: q1 and v1 equal q and v, and only derivatives differ.
+        """
         solver, terms = self._solver, self._solver.terms
         copies = [terms.add(f"{x}1", start=x) for x in ("q", "v", "sines")]
         position = [*terms.element_terms(("psi",), "v", 1), *solver.solve(1), self._correction("q", 1)]

@@ -90,7 +90,11 @@ class ScenePrograms(RunPrograms):
 
     @property
     def piece_count(self) -> int:
-        """The number of values of the output "pieces": piecewise smooth elements, and loads of edges."""
+        """The number of values of the output "pieces".
+
+        There is one for each piecewise smooth element, the index of the piece in use, and one for each load of a slot or of an
+        edge of a guide, whose sign selects the piece.
+        """
         return self.scratch["pieces"]
 
     @cached_property

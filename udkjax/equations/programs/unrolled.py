@@ -97,7 +97,7 @@ class Unrolled:
         self._inputs |= {s: (x, k) for x, scalars in (state | begins).items() for k, s in scalars.items()}
 
     def program(self, *outputs: str) -> UnrolledProgram:
-        """Return the program of some outputs, one of those in `asked`."""
+        """Return the program of a tuple of outputs that is one of those in `asked`."""
         return self._program(self._results[outputs], {})
 
     def derivative(self, *of: str) -> UnrolledDerivative:

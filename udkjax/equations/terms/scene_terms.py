@@ -404,7 +404,15 @@ def compliance(w: KernelWriter, k: int, base: int = BODY_CONSTANTS) -> Scalar:
 
 
 def write_jt(w: KernelWriter, group: ConstraintGroup, entries: list[list[Scalar]], x: list[Scalar], to: str = "jt_x") -> None:
-    """Write code that adds Psi_q^T x to the array `to` of coordinates, with the `entries` of the eliminated rows and their x."""
+    """Write code that adds Psi_q^T x of a group's constraint to the array `to`, which has an entry for each coordinate.
+
+    Args:
+        w: the writer.
+        group: the group.
+        entries: the entries of Psi_q in the constraint's rows.
+        x: the entries of x for these rows.
+        to: the array.
+    """
     for k in range(group.coordinates):
         total = dot(w.graph, [row[k] for row in entries], x)
         if not total.is_zero:

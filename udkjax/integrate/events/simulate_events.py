@@ -294,7 +294,7 @@ def _with_joints_held_by_drivers(
     mechanism: Any, given: Given, found: EventRun, sticking: dict[str, Array] | None, xp: ModuleType
 ) -> dict[str, Array] | None:
     """Return masks of the output times at which joints stick, by joint, including those at which drivers hold joints at rest."""
-    names = [x.name for x in given.phases.sticking if x.contact < 0]
+    names = [x.name for x in given.phases.sticking if x.contact < 0]  # without rubbing contacts, which no driver holds
     analysis = given.phases.analyses[SCENE]
     if not sticking or not names or not mechanism.drivers or analysis is None:
         return sticking

@@ -118,7 +118,7 @@ def portable_engine(
     if data["marks"]:
         modules["mark"] = _operation(MarkRows(scene_programs(scene).with_all_rows))
     if runs and operation is not None:
-        modules |= _run(operation, problem, data, watched, scene)
+        modules |= _run_modules(operation, problem, data, watched, scene)
         if data["sampled"] and any(0 <= k - numbers.count < numbers.knots for k in numbers.changing):
             raise ValueError("parameters move breakpoints of a scene that has samples: leave out those of its motion laws")
     code = scene_programs(scene, analysis.redundant_rows) if operation is None else operation.code
@@ -198,7 +198,9 @@ def _problem(mechanism: Mechanism, analysis: Analysis, rtol: float, atol: float)
     return replace(problem, smallest=np.asarray(0.0), rate=np.asarray(1.0))
 
 
-def _run(operation: RunStates, problem: Problem, data: JsonObject, events: PortableEvents, scene: Mechanism) -> JsonObject:
+def _run_modules(
+    operation: RunStates, problem: Problem, data: JsonObject, events: PortableEvents, scene: Mechanism
+) -> JsonObject:
     """Return the modules by which a page runs the scene; the entries that describe their inputs are put into `data`."""
     inputs = packed(problem)
     inputs_by_name = dict(zip(Operation.input_names, inputs, strict=False))

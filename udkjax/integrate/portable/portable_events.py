@@ -44,7 +44,7 @@ def names_of_run(mechanism: Mechanism, events: Sequence[Event]) -> tuple[str, ..
 
     Args:
         mechanism: the scene.
-        events: the events of its runs, expanded.
+        events: the events of its runs, where each that stands for several is replaced by these (`expanded`).
     """
     return names_of_events(*events_and_phases(mechanism, events, analyse(mechanism))[1:])
 

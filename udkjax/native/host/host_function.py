@@ -178,7 +178,7 @@ def _target(function: HostFunction) -> _Target:
 
     @ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)
     def handle(frame: int) -> int | None:
-        if extension := _word(frame + EXTENSIONS):
+        if extension := _word(frame + EXTENSIONS):  # XLA asks for the version alone
             metadata = _word(extension + METADATA)
             for offset, number in zip((MAJOR, MINOR), VERSION, strict=True):
                 ctypes.c_int32.from_address(metadata + offset).value = number

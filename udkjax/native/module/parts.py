@@ -212,7 +212,10 @@ class FallbackPart(Part):
 
 
 class StiffnessPart(Part):
-    """The implicit steps of stiff motions; this base class has none, and its runs never leave the module."""
+    """The implicit steps of stiff motions.
+
+    With this base class all steps are explicit, and no run continues in another module (leaving.py).
+    """
 
     method: Method | None = None
     """The implicit method."""
@@ -269,8 +272,11 @@ class StiffnessPart(Part):
     def choose_next(self, f: Function, s: Lane, stepping: Value, accept: Value, implicit: Value, tries: Value | None):
         """Choose the method of the next step after an attempt.
 
-        The arguments are masks: of lanes that made an attempt, whose step was accepted, was implicit, and was a trial (None:
-        there are no trials).
+        Args:
+            stepping: mask of the lanes that made an attempt.
+            accept: mask of the lanes whose step was accepted.
+            implicit: mask of the lanes whose attempt was implicit.
+            tries: mask of the lanes whose attempt was a trial of an implicit step; None: the module makes no trials.
         """
 
     # --- the end of the next step

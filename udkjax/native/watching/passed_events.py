@@ -63,7 +63,10 @@ class Sliding:
 
     @property
     def most_pivots(self) -> int:
-        """The largest number of pivots at one event: rounds in which joints that violate the law change their modes."""
+        """A limit on pivots at one event, rounds in which joints that violate the law of friction change their modes.
+
+        With more of them the run ends at the event, and Python decides.
+        """
         return (self.block_steps + self.single_steps) * self.count + 8
 
     @property

@@ -72,7 +72,7 @@ class WatchMemory(PassingRuns):
         for name in LANE_NUMBERS:
             self.put_lane_entry(f, name, lane, f.const(0.0))
         first = self.lane_entry(f, "start", lane)
-        for name in ("node", "sure_t", "fresh", "first_t"):  # a run that starts at a breakpoint begins after it
+        for name in ("node", "sure_t", "fresh", "first_t"):  # after a breakpoint at the start, `record_step` renews `fresh`
             self.put_lane_entry(f, name, lane, first)
         self.put_lane_entry(f, "event", lane, f.const(-1.0))
         self.put_lane_entry(f, "share", lane, f.const(1.0))

@@ -231,7 +231,7 @@ def _parse_joint(mechanism: Mechanism, text: str) -> Channel:
     quantity = _check_quantity(f"joint {quote(name)}", rest, known, [f"{b}.{q}" for b in bodies for q in LOADS])
     units, label = _UNITS[quantity], f"joint.{name}.{quantity}"
     if quantity in LOADS:
-        return Channel(label, units, "reactions", "joint", name, pair[-1:], (), quantity)
+        return Channel(label, units, "reactions", "joint", name, pair[-1:], (), quantity)  # on the last
     needs: Needs = "accelerations" if quantity in _ACCELERATIONS else "states"
     return Channel(label, units, needs, "joint", name, pair, (), quantity)
 

@@ -54,9 +54,9 @@ def nodes(last: int) -> np.ndarray:
 class Crossing(NamedTuple):
     """A point of a branch where branches meet, interpolated from both sides."""
 
-    at: Float[Array, "n+1"]
-    slope: Float[Array, "n+1"]  # unit tangent
-    dq: Float[Array, "n"]
+    at: Float[Array, "n+1"]  # q and the value s
+    slope: Float[Array, "n+1"]  # unit tangent of the curve
+    dq: Float[Array, "n"]  # derivatives of q by s, as the next two
     ddq: Float[Array, "n"]
     dddq: Float[Array, "n"]
     spacing: Float[Array, ""]  # the step h

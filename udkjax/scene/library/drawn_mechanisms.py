@@ -20,9 +20,9 @@ from udkjax.scene.library.posed_bodies import (
     ORIGINS,
     apex,
     as_array,
-    derivative,
     gravity_vector,
     unit_vector,
+    value_and_rate,
     with_concrete_numbers,
 )
 from udkjax.scene.mechanism import Mechanism
@@ -155,6 +155,6 @@ def draw_on_pose(
 
     Velocities of the pins follow from the rate of s; `more` are further arguments of `Drawing`.
     """
-    pins, velocities = derivative(places, as_array(s), rate)
+    pins, velocities = value_and_rate(places, as_array(s), rate)
     drawing = Drawing(pins, links, ground, velocities=velocities, gravity=gravity_vector(gravity), name=name, **more)
     return drawing.mechanism()

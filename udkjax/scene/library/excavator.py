@@ -17,9 +17,9 @@ from udkjax.scene.library.posed_bodies import (
     as_array,
     bar_pose,
     bodies_on_pose,
-    derivative,
     gravity_vector,
     uniform_rod,
+    value_and_rate,
     with_concrete_numbers,
 )
 from udkjax.scene.mechanism import Mechanism
@@ -86,7 +86,7 @@ def excavator(
 
     # Free minus actual length of each cylinder, by the principle of virtual work over the three angles.
     start = as_array(angles)
-    values, rates = zip(*(derivative(extents_and_energy, start, direction) for direction in np.eye(3)), strict=True)
+    values, rates = zip(*(value_and_rate(extents_and_energy, start, direction) for direction in np.eye(3)), strict=True)
     length, virtual_work = values[0][0], as_array([energy for _, energy in rates])
     arms = as_array([extents for extents, _ in rates])
     shortening = array_namespace(arms, virtual_work).linalg.solve(arms, virtual_work) / as_array(stiffness)

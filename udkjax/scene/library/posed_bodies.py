@@ -49,7 +49,7 @@ def _as_concrete(value: ArrayLike) -> ArrayLike:
     return value if isinstance(value, Tracer) else np.asarray(value, float)
 
 
-def derivative(function: Callable[..., PyTree], s: ArrayLike, rate: OneOrMore) -> tuple[PyTree, PyTree]:
+def value_and_rate(function: Callable[..., PyTree], s: ArrayLike, rate: OneOrMore) -> tuple[PyTree, PyTree]:
     """Return the value of a function at s, and its rate of change for a given rate of s.
 
     The rate is exact up to rounding. It is computed by JAX if a number is traced, otherwise by a complex step in NumPy.
@@ -74,7 +74,7 @@ def bodies_on_pose(
 
     `physics` has the mass and the inertia of each.
     """
-    poses, rates = derivative(pose, as_array(s), rate)
+    poses, rates = value_and_rate(pose, as_array(s), rate)
     bodies = zip(names, physics, poses, rates, strict=True)
     return {name: Body(mass, inertia, *body_pose, *body_rate) for name, (mass, inertia), body_pose, body_rate in bodies}
 

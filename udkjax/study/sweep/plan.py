@@ -101,7 +101,7 @@ class SweepPlan:
 
     @cached_property
     def groups(self) -> tuple[Group, ...]:
-        """The groups of members, one for each combination of structures of choices."""
+        """The groups of members, whose chosen values have the same pytree structure, and which thus share a program."""
         chosen = [column for column in self.columns if column.is_choice]
         places = self.places(np.arange(self.size))
         kinds = np.stack(

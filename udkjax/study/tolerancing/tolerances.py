@@ -124,7 +124,10 @@ class ToleranceAnalysis:
 
     @cached_property
     def second_order(self) -> SecondOrder:
-        """Means and standard deviations from first and second differences, without samples; compared with those of samples."""
+        """Means and standard deviations from first and second differences, without samples.
+
+        Each measure is trusted if both agree with those of the samples.
+        """
         model, (own, pairs) = self._quadratic, self._parts
         mean, deviation = model.mean, np.sqrt(own.sum(1) + pairs.sum((1, 2)) / 2.0)
         of_samples, spread = self._reached.mean(0), self._reached.std(0)

@@ -89,8 +89,8 @@ def place(
         P: the joints P (K, T).
         Q: the joints Q.
         turn: the unit numbers exp(i angle) of the links that carry Q.
-        one: the first number of the form (K, 1).
-        two: the second number.
+        one: `one` of the form, as above (K, 1).
+        two: `two` of the form.
         side: 1 or -1, the side of P-Q on which R is (K, 1).
         least: the sine of the angle between both links that replaces a smaller one, where a dyad cannot be closed.
     """
