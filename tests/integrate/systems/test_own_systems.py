@@ -436,10 +436,14 @@ def test_functions_that_do_not_fit_are_named(functions, message):
 @pytest.mark.parametrize(
     ("functions", "message"),
     [
-        ({"mass": lambda q: -jnp.eye(2)}, "the mass matrix is not positive definite: its eigenvalues are -1 to -1"),
+        ({"mass": lambda q: -jnp.eye(2)}, r"not positive definite: its eigenvalues are -1 to -1.*check the signs in `mass`"),
+        (
+            {"mass": lambda q: jnp.eye(2) + jnp.sin(q[0]) * jnp.array([[0.0, 0.1], [0.0, 0.0]])},
+            r"mass must return a symmetric matrix; at q = .* entry \[0, 1\] is 0.012.*, and \[1, 0\] is 0",
+        ),
         (
             {"mass": lambda q: jnp.diag(jnp.array([1.0, 0.0]))},
-            "mass matrix is not positive definite: its eigenvalues are 0 to 1",
+            "mass matrix is not positive definite: its eigenvalues are 0 to 1. Add mass in directions that",
         ),
         ({"constraint": lambda t, q: {"rod": jnp.log(-q[0])}}, "constraint of the system is not finite"),
         ({"mass": lambda q: None}, r"mass must return the shape \(2, 2\) for 2 coordinates, not None"),

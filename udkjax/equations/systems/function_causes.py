@@ -34,10 +34,13 @@ def cause_of(values: Mapping[str, ArrayLike]) -> str:
         return f"{' and '.join(broken)} of the system {'is' if len(broken) == 1 else 'are'} not finite"
     M = np.asarray(values["mass"])
     eigenvalues = np.linalg.eigvalsh((M + M.T) / 2)
-    if not eigenvalues[0] > SINGULAR_TOL * np.abs(eigenvalues).max():
-        return (
-            f"the mass matrix is not positive definite: its eigenvalues are {eigenvalues[0]:.3g} to {eigenvalues[-1]:.3g}. Add "
-            "mass in directions that the constraints fix, such as Psi_q^T Psi_q to M and Psi_q^T gamma to F: the motion stays "
-            "the same"
+    small = SINGULAR_TOL * np.abs(eigenvalues).max()
+    if eigenvalues[0] > small:
+        return ""
+    cure = "No motion may have a negative kinetic energy v^T M v / 2: check the signs in `mass`"
+    if eigenvalues[0] >= -small:
+        cure = (
+            "Add mass in directions that the constraints fix, such as Psi_q^T Psi_q to M and Psi_q^T gamma to F: the motion "
+            "stays the same"
         )
-    return ""
+    return f"the mass matrix is not positive definite: its eigenvalues are {eigenvalues[0]:.3g} to {eigenvalues[-1]:.3g}. {cure}"

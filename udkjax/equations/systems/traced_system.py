@@ -24,7 +24,7 @@ from jaxtyping import Array, Float
 
 from udkjax.annotations import Time, Vector
 from udkjax.equations.terms.elements import choose_shorter, gamma_by_entries
-from udkjax.expressions import Differential, Graph, Scalar, may_have_kinks, trace
+from udkjax.expressions import Differential, Graph, Scalar, ScalarProgram, may_have_kinks, trace
 from udkjax.expressions.algebra.differential import SparseRow
 from udkjax.programs.identity_cache import cached_by_identity, is_concrete
 from udkjax.requirements import ArgumentError, describe, tracing
@@ -37,6 +37,8 @@ FUNCTION_ARGUMENTS = {
     "velocity_constraint": "tqv",
     "potential": "tq",
 }  # by name, with the names of the arguments
+# Largest difference of M_ij and M_ji, relative to the largest entry: far above rounding errors, below any entry that matters.
+SYMMETRY_TOL = 1e-8
 MOST_NUMBERS = 20_000  # more, as of a table, would be copied to the memory of every lane
 
 
@@ -97,6 +99,28 @@ class SystemFunctions:
     def has(self, name: str) -> bool:
         """Return whether the system has the function `name`, one of `FUNCTION_ARGUMENTS`."""
         return name in self._functions
+
+    def require_symmetric_mass(self, numbers: Sequence[Any]):
+        """Raise `ArgumentError` if M with these concrete numbers is not symmetric at a random position; entries may be NaN."""
+        pairs = [(i, j) for i, row in enumerate(self.mass) for j in row if i < j or i not in self.mass[j]]
+        zero = self.graph.constant(0.0)
+        entries = [(self.mass[i].get(j, zero), self.mass[j].get(i, zero)) for i, j in pairs]
+        if all(a == b for a, b in entries):
+            return
+        inputs = [s for x in self.numbers for s in x.flat]
+        values = [float(x) for array in numbers for x in np.ravel(array)]
+        known = [k for k, s in enumerate(inputs) if s.constant is None]
+        program = ScalarProgram(self.graph, [*(inputs[k] for k in known), *self.q], [s for pair in entries for s in pair])
+        somewhere = np.random.default_rng(0).normal(size=self.n)  # M is symmetric everywhere or nowhere
+        found = np.reshape(program([*(values[k] for k in known), *somewhere.tolist()]), (-1, 2))
+        differences = np.abs(found[:, 0] - found[:, 1])
+        worst = int(np.argmax(np.nan_to_num(differences)))
+        if differences[worst] > SYMMETRY_TOL * np.abs(found).max(initial=0.0, where=np.isfinite(found)):
+            (i, j), (a, b) = pairs[worst], found[worst]
+            raise ArgumentError(
+                f"mass must return a symmetric matrix; at q = {somewhere.round(3).tolist()} entry [{i}, {j}] is {a:.6g}, and "
+                f"[{j}, {i}] is {b:.6g}"
+            )
 
     @property
     def other_terms(self) -> dict[str, list[Scalar]]:
@@ -255,7 +279,7 @@ def trace_system(system: Any, n: int) -> TracedSystem:
     """Return a `ConstrainedSystem` of n coordinates with traced functions; the result is cached.
 
     Raises:
-        ArgumentError: a function returns an array of another shape than `ConstrainedSystem` says.
+        ArgumentError: a function returns an array of another shape than `ConstrainedSystem` says, or M is not symmetric.
     """
     given = {name: getattr(system, name) for name in FUNCTION_ARGUMENTS if getattr(system, name) is not None}
     leaves, others = eqx.partition(given, eqx.is_inexact_array)
@@ -287,7 +311,10 @@ def trace_system(system: Any, n: int) -> TracedSystem:
         functions[name] = closed.replace(consts=[None] * len(constants)), constants, of_leaves
     is_fixed = [k >= count and not isinstance(x, Tracer) for k, x in enumerate(numbers)]
     of_rows = tuple(label for name in ("constraint", "velocity_constraint") for label in labels.get(name, ()))
-    return TracedSystem(numbers, SystemFunctions(functions, numbers, is_fixed, n), of_rows, system.breakpoints)
+    traced = TracedSystem(numbers, SystemFunctions(functions, numbers, is_fixed, n), of_rows, system.breakpoints)
+    if is_concrete(numbers):
+        traced.functions.require_symmetric_mass(numbers)
+    return traced
 
 
 def joined_rows(value: Any) -> Any:
