@@ -53,11 +53,20 @@ def checks_instances(cls: type) -> Callable[[ArgumentCheck], ArgumentCheck]:
 
 
 def require_thresholds(name: str, value: Any, given: GivenArguments) -> None:
-    """Require that the numbers in the fields of a dataclass, such as a method or gains, are finite, and zero or positive."""
+    """Require that numbers in the fields of a dataclass, such as a method or gains, are finite.
+
+    Those of the library's classes must also be single numbers, zero or positive. A user's subclass may add any arrays.
+    """
+    library = next(cls for cls in type(value).__mro__ if cls.__module__.startswith(f"{__package__}."))
+    thresholds = {field.name for field in dataclasses.fields(library)}
     for field in dataclasses.fields(value):
         x = getattr(value, field.name)
-        if eqx.is_array(x) or isinstance(x, float):
+        if not (eqx.is_array(x) or isinstance(x, float)):
+            continue
+        if field.name in thresholds:
             require_number(f"{name}.{field.name}", x, "not negative")
+        else:
+            require_finite(f"{name}.{field.name}", x)
 
 
 def of_kind(condition: str, is_valid: Callable[[Any], bool]) -> ArgumentCheck:

@@ -32,6 +32,15 @@ class OwnBaumgarte(udk.Stabilization):
         return v, a - at.change_of_velocities(2 * self.alpha * at.psi_dot + self.beta**2 * at.psi)
 
 
+class ByRows(udk.Stabilization):
+    """The same with gains for each row, all of them negative."""
+
+    gains: jax.Array  # (2, m)
+
+    def rates(self, at, v, a):
+        return v, a + at.change_of_velocities(2 * self.gains[0] * at.psi_dot - self.gains[1] ** 2 * at.psi)
+
+
 class Relaxing(udk.Stabilization):
     """Violations fade at a rate, which makes q' differ from v as long as there are any."""
 
@@ -136,6 +145,19 @@ def test_own_text_of_a_stabilization_of_the_package(method):
     assert own.stats["steps"] == other.stats["steps"]
     assert_allclose(own.q, other.q, atol=1e-11)
     assert_allclose(own.v, other.v, atol=1e-10)
+
+
+def test_fields_may_be_any_finite_numbers():
+    """Arrays, and negative ones: they are no thresholds."""
+    gains = -np.tile([[5.0], [4.0]], 12)
+    own, other = (run("redundant", x) for x in (ByRows(jnp.array(gains)), OwnBaumgarte(jnp.array(5.0), jnp.array(4.0))))
+    assert own.settings["engine"] == "native"
+    assert_allclose(own.q, other.q, atol=1e-12)
+    batch = jax.vmap(lambda gains: run("redundant", ByRows(gains)).q)(jnp.stack([gains, 2 * gains]))
+    assert_allclose(batch[0], own.q, atol=1e-12)
+    gains[1, 2] = np.nan
+    with pytest.raises(ValueError, match=r"stabilization.gains\[1, 2\] is nan: it must be finite"):
+        run("redundant", ByRows(jnp.array(gains)))
 
 
 def test_projection_by_hand():
