@@ -7,6 +7,7 @@ import pytest
 
 import udkjax as udk
 from tests.choices import fast
+from udkjax.programs.deferred import deferred
 from udkjax.programs.undefined import defined
 
 LENGTH = "pin.A.length"  # with 0.5 m the loop cannot close
@@ -77,35 +78,38 @@ SLOW = {
 ALL = fast(FUNCTIONS, [*FUNCTIONS, *SLOW])
 
 
-def alone(f):
-    return jax.jit(f)(BAD)
+def alone(program):
+    return lambda f: program(f)(BAD)
 
 
-def in_batch(f):
-    return jax.tree.map(lambda x: x[1], jax.jit(jax.vmap(f))(jnp.array([GOOD, BAD])))
+def in_batch(program):
+    return lambda f: jax.tree.map(lambda x: x[1], program(jax.vmap(f))(jnp.array([GOOD, BAD])))
 
 
 @pytest.mark.parametrize("name", ALL)
 def test_derivatives_of_what_failed_beside_what_did_not(name):
     """Forward and reverse mode agree on all outputs that are defined."""
-    check(name, in_batch)
+    check(name, in_batch(deferred))
 
 
 @pytest.mark.parametrize("name", fast(["simulate, loop", "assemble"], [*FUNCTIONS, *SLOW]))
 def test_derivatives_of_what_failed_alone(name):
-    check(name, alone)
+    check(name, alone(deferred))
+
+
+@pytest.mark.parametrize("mode", [alone, in_batch])
+@pytest.mark.parametrize("name", fast(["simulate, state"], [*FUNCTIONS, *SLOW]))
+def test_compiled_derivatives_of_what_failed(name, mode):
+    check(name, mode(jax.jit))
 
 
 def check(name, mode):
     function = (FUNCTIONS | SLOW)[name]
 
-    def total(p):
-        y = function(p)
-        return jnp.sum(jnp.where(jnp.isnan(y), 0.0, y))
-
     def everything(p):
         y, dy = jax.jvp(function, (p,), (1.0,))
-        return y, dy, jax.grad(total)(p), jax.grad(lambda p: jnp.sum(function(p)))(p)
+        y, back = jax.vjp(function, p)
+        return y, dy, back(jnp.where(jnp.isnan(y), 0.0, 1.0))[0], back(jnp.ones(y.shape))[0]
 
     y, dy, masked, whole = map(np.asarray, mode(everything))
     is_lost = np.isnan(y)
@@ -119,7 +123,7 @@ def test_outputs_before_a_failure_keep_their_derivatives():
     """They are those of a run that ends there, whose outputs are all defined."""
 
     def slopes(ts, **settings):
-        return jax.jit(jax.value_and_grad(lambda p: jnp.sum(udk.simulate(heavy(p), ts, **settings).q[1] ** 2)))(1.0)
+        return deferred(jax.value_and_grad(lambda p: jnp.sum(udk.simulate(heavy(p), ts, **settings).q[1] ** 2)))(1.0)
 
     most = int(udk.simulate(heavy(1.0), TS[:3]).stats["steps"])
     assert np.isnan(udk.simulate(heavy(1.0), TS, max_steps=most, throw=False).q[-1]).all()
@@ -131,7 +135,7 @@ def test_eager_derivatives_of_a_run_that_fails_raise_its_error(settings):
     """With the same message as the run itself."""
     run = lambda p: udk.simulate(heavy(p), TS, **settings).q[-1, 0, 2]  # noqa: E731
     messages = []
-    for call in (run, jax.grad(run), jax.jacfwd(run)):
+    for call in (run, jax.grad(run), lambda p: jax.jvp(run, (p,), (1.0,))):
         with pytest.raises(udk.SimulationError) as error:
             call(1.0)
         messages.append(str(error.value))
