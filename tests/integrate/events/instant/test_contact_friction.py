@@ -166,7 +166,7 @@ def test_energy_never_grows_in_impacts(count):
 def test_rounding_errors_of_speeds_are_no_impact(xp):
     """Contacts that are held in few freedoms, with speeds of 1e-28 in ratios that no motion has: no impulses, nothing blocked."""
     rng, unsolved = np.random.default_rng(7), 0
-    for N, n in rng.integers((2, 1), (4, 3), size=(40 if xp is np else 3, 2)):
+    for N, n in rng.integers((2, 1), (4, 3), size=(40 if xp is np else 1, 2)):
         U = rng.normal(size=(2 * N, n))
         is_contact, tangents = np.arange(2 * N) < N, np.append(np.arange(N) + N, np.full(N, -1))
         mu = np.append(rng.uniform(0.1, 1.5, N), np.zeros(N))
@@ -369,7 +369,7 @@ def test_derivatives_where_an_impact_ends_all_sliding():
         assert run(x).sticking[joint][1]
         change = (end(x + h) - end(x - h)) / (2 * h)
         assert np.abs(change).max() > 0.9
-        np.testing.assert_allclose(jax.jacfwd(end)(x), change, rtol=1e-6, atol=1e-8)
+        np.testing.assert_allclose(jax.jvp(end, (x,), (1.0,))[1], change, rtol=1e-6, atol=1e-8)
 
 
 @pytest.mark.slow
