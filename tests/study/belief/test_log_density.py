@@ -11,6 +11,7 @@ from scipy.integrate import quad
 
 import udkjax as udk
 from tests.study.identify.conftest import ANGLE, NAMES, TS, pendulum, swing
+from udkjax.programs.deferred import deferred
 from udkjax.study.identify.density.priors import PriorDensity
 from udkjax.study.identify.problem.unknowns import Target, Unknown, Unknowns
 
@@ -57,7 +58,7 @@ def test_it_is_the_cost_of_identify_with_priors_jacobian_and_noise(problem):
     assert_allclose(differences, differences[0], rtol=0, atol=1e-9 * np.abs(expected).max())
     assert problem.names == (*NAMES, "force.spring.stiffness", *least_squares.all_names[3:], "noise of body.rod.omega")
     assert_allclose(problem.parameters(x)[NAMES[0]], values[:, 0], rtol=1e-14)
-    each = jax.jit(problem.log_likelihoods)(x[0])
+    each = deferred(problem.log_likelihoods)(x[0])
     assert_allclose(each.sum() + problem.log_prior(x[0]), problem.log_densities(x[:1])[0], rtol=1e-12)
 
 
@@ -66,14 +67,14 @@ def test_derivatives_are_those_of_differences_to_second_order(problem):
         pendulum(0.4), record(), PARAMETERS[:2], priors={NAMES[0]: lambda x: -((x - 0.4) ** 2)}, tol=1e-12, max_steps=4096
     )
     x, h = np.array([0.1, -0.2]), 1e-5
-    slopes = jax.jit(jax.vmap(jax.grad(exact.log_density)))
+    slopes = deferred(jax.vmap(jax.grad(exact.log_density)))
     steps = np.concatenate([x + h * np.eye(2), x - h * np.eye(2)])
     values, gradients = np.asarray(exact.log_densities(steps)), np.asarray(slopes(steps))
     gradient = slopes(x[None])[0]
     assert_allclose(gradient, (values[:2] - values[2:]) / (2 * h), rtol=1e-6)
-    hessian = jax.jit(jax.hessian(exact.log_density))(x)
+    hessian = deferred(jax.hessian(exact.log_density))(x)
     assert_allclose(hessian, (gradients[:2] - gradients[2:]) / (2 * h), rtol=1e-6)
-    forward = jax.jit(lambda x, d: jax.jvp(exact.log_density, (x,), (d,))[1])(x, np.array([1.0, -2.0]))
+    forward = deferred(lambda x, d: jax.jvp(exact.log_density, (x,), (d,))[1])(x, np.array([1.0, -2.0]))
     assert_allclose(forward, gradient @ np.array([1.0, -2.0]), rtol=1e-12)
 
 
@@ -82,11 +83,11 @@ def test_failed_runs_have_no_density_and_no_slope_beside_others_in_lanes(problem
     x[1, 3] = 1e9  # a velocity of which a run takes more steps than it may
     x[1, 4] = 1e9
     x[2, 2] = np.nan
-    both = jax.jit(jax.vmap(jax.value_and_grad(problem.log_density)))
+    both = deferred(jax.vmap(jax.value_and_grad(problem.log_density)))
     values, slopes = map(np.asarray, both(x))
     assert_array_equal(values[1:], -np.inf)
     assert_array_equal(slopes[1:], 0.0)
-    alone = jax.jit(jax.value_and_grad(problem.log_density))(x[0])
+    alone = deferred(jax.value_and_grad(problem.log_density))(x[0])
     assert_allclose(values[0], alone[0], rtol=1e-12)
     assert_allclose(slopes[0], alone[1], rtol=1e-8, atol=1e-8 * np.abs(slopes[0]).max())
     assert np.abs(slopes[0]).min() > 0.0
@@ -97,22 +98,22 @@ def test_sums_of_many_residuals_are_those_of_numpy(samples, members):
     ts = np.linspace(0.0, 1.0, samples)
     problem = udk.inference(pendulum(0.4), record(None, ts), NAMES[:1])
     x = points(problem, count=members)
-    predicted = np.asarray(jax.jit(jax.vmap(problem.predicted))(x))
+    predicted = np.asarray(deferred(jax.vmap(problem.predicted))(x))
     sigma = problem.parameters(x)[f"noise of {ANGLE}"][:, None]
     each = -0.5 * ((predicted - problem.fit_problem.measured) / sigma) ** 2 - np.log(sigma * np.sqrt(2.0 * np.pi))
     prior = np.asarray(jax.vmap(problem.log_prior)(x))
     assert_allclose(problem.log_densities(x), each.sum(1) + prior, rtol=1e-10)
-    assert_allclose(jax.jit(jax.vmap(lambda x: jnp.sum(problem.log_likelihoods(x))))(x), each.sum(1), rtol=1e-10)
+    assert_allclose(deferred(jax.vmap(lambda x: jnp.sum(problem.log_likelihoods(x))))(x), each.sum(1), rtol=1e-10)
 
 
 def test_other_measured_values_share_programs(problem):
     """Also where the values are traced, and together with derivatives."""
     x, values = points(problem, count=1)[0], problem.fit_problem.measured + 0.01
     other = problem.with_measured(values)
-    both = jax.jit(jax.vmap(lambda y: jax.value_and_grad(problem.with_measured(y).log_density)(x)))
+    both = deferred(jax.vmap(lambda y: jax.value_and_grad(problem.with_measured(y).log_density)(x)))
     found, slopes = both(np.stack([problem.fit_problem.measured, values]))
     assert_allclose(found, [problem.log_densities(x[None])[0], other.log_densities(x[None])[0]], rtol=1e-10)
-    assert_allclose(slopes[1], jax.jit(jax.grad(other.log_density))(x), rtol=1e-10)
+    assert_allclose(slopes[1], deferred(jax.grad(other.log_density))(x), rtol=1e-10)
     assert other.programs is problem.programs and abs(found[1] - found[0]) > 1.0
     count = problem.programs["densities"]._cache_size()
     problem.with_measured(values + 0.01).log_densities(x[None])

@@ -18,7 +18,7 @@ from tests.integrate.events.run.passing import by_the_loop, counted
 from udkjax.native.module.layout import MEMBERS_PER_THREAD
 
 TS = np.linspace(0.0, 2.0, 41)
-CHAIN = rubbing(udk.library.chain(5, 0.4), 0.15, 0.005, law="set-valued")
+CHAIN, SMALL = (rubbing(udk.library.chain(count, 0.4), 0.15, 0.005, law="set-valued") for count in (5, 3))
 
 
 class Gate(udk.ForceElement):
@@ -78,22 +78,22 @@ def test_machine_code_passes_events_as_the_loop_does(case, monkeypatch):
 
 def test_the_record_of_events_is_filled_again_and_again(monkeypatch):
     """A call that has passed as many events as its record has room for ends, and the next goes on."""
-    by_the_loop(monkeypatch, passed=2)
-    few, calls, _ = counted(lambda: udk.simulate(CHAIN, TS))
-    assert calls > 10
+    by_the_loop(monkeypatch, passed=1)
+    few, calls, _ = counted(lambda: udk.simulate(SMALL, TS))
+    assert calls > 5
     monkeypatch.undo()
-    many = udk.simulate(CHAIN, TS)
+    many = udk.simulate(SMALL, TS)
     np.testing.assert_array_equal(few.events.index, many.events.index)
     np.testing.assert_allclose(few.q, many.q, atol=1e-8)
     assert few.stats == many.stats
 
 
 def test_lanes_pass_events_as_single_runs_do():
-    scale = np.linspace(0.2, 3.0, 2 * MEMBERS_PER_THREAD + 5)
+    scale = np.geomspace(0.05, 3.0, 2 * MEMBERS_PER_THREAD + 5)
 
     def run(scale):
-        forces = [eqx.tree_at(lambda x: x.coefficient, x, scale * x.coefficient) for x in CHAIN._forces]
-        found = udk.simulate(eqx.tree_at(lambda m: m._forces, CHAIN, tuple(forces)), TS, throw=False)
+        forces = [eqx.tree_at(lambda x: x.coefficient, x, scale * x.coefficient) for x in SMALL._forces]
+        found = udk.simulate(eqx.tree_at(lambda m: m._forces, SMALL, tuple(forces)), TS, throw=False)
         return found.q, found.v, found.events
 
     q, v, events = jax.vmap(run)(jnp.asarray(scale))
@@ -108,11 +108,11 @@ def test_lanes_pass_events_as_single_runs_do():
 
 
 def test_most_steps_and_most_events_hold_for_all_stretches_together():
-    few = udk.simulate(CHAIN, TS, max_events=5, throw=False)
+    few = udk.simulate(SMALL, TS, max_events=5, throw=False)
     assert int(few.events.count) == 5 and few.result.name == "event_limit"
-    whole = udk.simulate(CHAIN, TS)
+    whole = udk.simulate(SMALL, TS)
     steps = int(whole.stats["steps"]) // 2
-    short = udk.simulate(CHAIN, TS, max_steps=steps, throw=False)
+    short = udk.simulate(SMALL, TS, max_steps=steps, throw=False)
     assert short.result.name == "step_limit" and int(short.stats["steps"]) <= steps
 
 
