@@ -57,8 +57,8 @@ def test_the_derivatives_of_the_loss_are_exact(curve):
     margin = np.full(len(trials.x), 1e-3)
     found = problem.evaluate(trials, margin)
     slopes = 2.0 * np.einsum("mjgp,mjg->mp", found.by_unknowns, found.r)
-    for k in range(problem.unknowns):
-        step = 1e-6 * np.eye(problem.unknowns)[k]
+    for k in range(problem.unknown_count):
+        step = 1e-6 * np.eye(problem.unknown_count)[k]
         ends = [trials._replace(x=x, s=problem.values_at(x, trials.s)) for x in (trials.x + step, trials.x - step)]
         above, below = (loss_of(problem.evaluate(end, margin)) for end in ends)
         np.testing.assert_allclose(slopes[:, k], (above - below) / 2e-6, atol=1e-6 * np.abs(slopes).max())

@@ -223,7 +223,7 @@ def test_the_loss_moves_when_any_parameter_does(kind):
 
 def require_slopes(problem, s):
     """Require that the derivatives of the loss by all unknowns are not zero, and agree with differences."""
-    x = np.append(problem.free.vector, np.full(problem.unknowns - problem.free.count, 0.1))[None]
+    x = np.append(problem.free.vector, np.full(problem.unknown_count - problem.free.count, 0.1))[None]
     q, reached = problem.march(x, s)
     assert reached.all()
 
@@ -255,9 +255,9 @@ def test_the_limit_of_a_turn_is_at_its_least_transmission():
         motors={"motor": {"pin": "O", "speed": 1.0}},
     )
     problem = udk.DesignSearch(crank_rocker, udk.PathGoal("P", [[6, 12], [4, 10], [2, 8]])).problem
-    start, pins_only = np.zeros(problem.unknowns), np.arange(problem.unknowns) < problem.free.count
+    start, pins_only = np.zeros(problem.unknown_count), np.arange(problem.unknown_count) < problem.free.count
     start[pins_only] = problem.free.vector
-    x = start + 0.02 * problem.scale * np.random.default_rng(0).standard_normal((20, problem.unknowns)) * pins_only
+    x = start + 0.02 * problem.scale * np.random.default_rng(0).standard_normal((20, problem.unknown_count)) * pins_only
 
     def least(x):  # tau^2, the minimum of a parabola in a turn of 2,000 steps
         square = problem.turn(x, 2000).transmission[:, :-1] ** 2
@@ -270,7 +270,7 @@ def test_the_limit_of_a_turn_is_at_its_least_transmission():
     assert turns.all()
     np.testing.assert_allclose(-limit[:, 0] / unit, least(x), atol=1e-8)
     h = 1e-5 * problem.scale
-    by_x = [(least(x + h * to) - least(x - h * to)) / (2 * h) for to in np.eye(problem.unknowns)[pins_only]]
+    by_x = [(least(x + h * to) - least(x - h * to)) / (2 * h) for to in np.eye(problem.unknown_count)[pins_only]]
     np.testing.assert_allclose(-slopes[:, 0, pins_only] / unit, np.transpose(by_x), atol=3e-6)
 
 
@@ -279,7 +279,7 @@ def test_a_free_start_of_given_values_is_an_unknown():
     targets, values = [[6, 12], [4, 10], [2, 8]], [0.0, 0.5, 1.0]
     goals = [udk.PathGoal("P", targets), udk.PathGoal("P", targets, values), udk.PathGoal("P", targets, values, "free")]
     problems = [udk.DesignSearch(FOUR_BAR, goal, ["pin.P"], rotation=False).problem for goal in goals]
-    assert [problem.unknowns - problem.free.count for problem in problems] == [0, 0, 1]
+    assert [problem.unknown_count - problem.free.count for problem in problems] == [0, 0, 1]
 
 
 @pytest.mark.slow

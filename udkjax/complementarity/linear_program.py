@@ -60,19 +60,19 @@ def maximize(c: Float[Array, "n"], G: Float[Array, "rows n"], h: Float[Array, "r
         y = jnp.linalg.solve(gram, held @ slope)
         y = y + jnp.linalg.solve(gram, held @ (slope - held.T @ y))
         ahead = slope - held.T @ y
-        late = state.steps > most // 2
+        by_bland = state.steps > most // 2  # the first of the candidates enters or leaves, which cannot cycle
         is_held = (jnp.linalg.norm(ahead) <= OPTIMALITY_TOL) | (state.active.sum() >= G.shape[1])
         negative = state.active & (y < -OPTIMALITY_TOL)
-        drops = _first(jnp.where(negative, jnp.where(late, -1.0, y), jnp.inf))
+        dropped = _first(jnp.where(negative, jnp.where(by_bland, -1.0, y), jnp.inf))
         rates = rows @ ahead
         blocks = ~state.active & (rates > BLOCKING_TOL * (sizes @ jnp.abs(ahead)))
         ways = jnp.where(blocks, jnp.maximum(right - rows @ state.x, 0.0) / jnp.where(blocks, rates, 1.0), jnp.inf)
         way = jnp.min(ways)
         nearest = blocks & (ways <= way)
-        adds = _first(jnp.where(nearest, jnp.where(late, -1.0, -rates), jnp.inf))
+        added = _first(jnp.where(nearest, jnp.where(by_bland, -1.0, -rates), jnp.inf))
         endless = ~is_held & ~jnp.any(blocks)
         moves = ~is_held & ~endless
-        active = (state.active & ~(is_held & jnp.any(negative) & drops)) | (moves & adds)
+        active = (state.active & ~(is_held & jnp.any(negative) & dropped)) | (moves & added)
         x = state.x + jnp.where(moves, way, 0.0) * ahead
         return _Iterate(x, y, active, state.steps + 1, is_held & ~jnp.any(negative), endless)
 

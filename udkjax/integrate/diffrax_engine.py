@@ -59,7 +59,7 @@ def integrate_by_diffrax(
     projected = project_all(equations, ts[1:], ys[1:]) if problem.compiled.plan.projected else ys[1:]
     ys = jnp.concatenate([initial[None], projected])
     violated = jax.lax.map(lambda x: violation(problem.equations, *x), (ts, ys), batch_size=STATES_AT_ONCE)
-    lost = jnp.min(jnp.where(reached & ~(violated <= problem.drift_tol), np.arange(float(len(ts))), np.inf))
+    first_drifted = jnp.min(jnp.where(reached & ~(violated <= problem.drift_tol), np.arange(float(len(ts))), np.inf))
     status = jnp.where(run.result == diffrax.RESULTS.max_steps_reached, Status.STEP_LIMIT, Status.STEP_TOO_SMALL)
     status = jnp.where(run.result == diffrax.RESULTS.successful, Status.DONE, status)
     status = status_at_end(problem.equations, ts[-1] - ts[0], status, t_end[0], end[0])
@@ -80,7 +80,7 @@ def integrate_by_diffrax(
     right_hand_sides = jnp.where(count == NOT_COUNTED, NOT_COUNTED, count + (problem.h is None))  # one chooses the step
     steps = run.stats["num_steps"], run.stats["num_accepted_steps"]
     q, v = jnp.split(ys, 2, axis=1)
-    output = IntegratorOutput(q, v, reached, lost, status, t_end[0], end[0], *steps, right_hand_sides, jnp.array(0))
+    output = IntegratorOutput(q, v, reached, first_drifted, status, t_end[0], end[0], *steps, right_hand_sides, jnp.array(0))
     q, v = (jnp.where(output.kept[:, None], y, jnp.nan) for y in (q, v))
     return output._replace(q=q, v=v)
 

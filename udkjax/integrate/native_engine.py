@@ -286,8 +286,8 @@ def mark_rows(
 def integrator_output(results: Sequence[Any]) -> IntegratorOutput:
     """Return the output of a run of one member from the results of its operation."""
     q, v, _, info = [x[0] for x in results]
-    code, t, tried, accepted, evaluations, written, lost, implicit = [info[k] for k in range(len(RunStates.info_names))]
+    code, t, tried, accepted, evaluations, written, first_drifted, implicit = [info[k] for k in range(len(RunStates.info_names))]
     number = np.arange(len(q))
     reached = (number <= written) & (number < len(q) - 1) | (code == Status.DONE)
     counts = [x.astype(int) for x in (tried, accepted, evaluations, implicit)]
-    return IntegratorOutput(q, v, reached, lost, code.astype(int), t, info[len(RunStates.info_names) :], *counts)
+    return IntegratorOutput(q, v, reached, first_drifted, code.astype(int), t, info[len(RunStates.info_names) :], *counts)

@@ -59,12 +59,12 @@ def outcome(run: FinishedRun, xp: ModuleType = jnp) -> tuple[Array, Array]:
     """Return the `Result` of a run and its time (s): that of the first output with too much drift, else the integrator's last."""
     raw = run.raw
     code = xp.where(raw.status == Status.DONE, Result.successful, failure(raw.status, xp))
-    is_lost = xp.isfinite(raw.lost)
-    code = xp.where(is_lost, xp.where(raw.lost == 0, Result.initial_state_open, Result.drift), code)
+    has_drifted = xp.isfinite(raw.first_drifted)
+    code = xp.where(has_drifted, xp.where(raw.first_drifted == 0, Result.initial_state_open, Result.drift), code)
     code = xp.where(run.missed, Result.drift, code)
     code = xp.where(run.closed, code, Result.could_not_assemble)
     code = xp.where(run.usable, code, Result.invalid_argument)
-    return code, xp.where(is_lost, run.ts[xp.where(is_lost, raw.lost, 0).astype(int)], raw.t)
+    return code, xp.where(has_drifted, run.ts[xp.where(has_drifted, raw.first_drifted, 0).astype(int)], raw.t)
 
 
 def status_at_end(equations: AbstractSystem, span: Array, status: Array, t: Array, y: Array) -> Array:

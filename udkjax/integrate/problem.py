@@ -64,10 +64,10 @@ class IntegratorOutput(NamedTuple):
     `status` is a `Status` of native/module/steps.py: `DONE`, or the reason of a failure.
     """
 
-    q: Float[Array, "T n"]  # NaN at times not reached, or after the first lost output
+    q: Float[Array, "T n"]  # NaN at times not reached, or after the first drifted one
     v: Float[Array, "T n"]
     reached: Bool[Array, "T"]  # whether the integrator came to each output time
-    lost: Float[Array, ""]  # index of the first output where Psi is violated by more than `drift_tol`, or infinite
+    first_drifted: Float[Array, ""]  # index of the first output where Psi is violated by more than `drift_tol`, or infinite
     status: Int[Array, ""]
     t: Float[Array, ""]  # the time of the end (s)
     y: Float[Array, "2n"]  # the state at t
@@ -78,5 +78,5 @@ class IntegratorOutput(NamedTuple):
 
     @property
     def kept(self) -> Bool[Array, "T"]:
-        """A mask of the outputs that were reached, up to the first lost one, which is included."""
-        return self.reached & (np.arange(self.reached.shape[-1]) <= self.lost)
+        """A mask of the outputs that were reached, up to the first that has drifted, which is included."""
+        return self.reached & (np.arange(self.reached.shape[-1]) <= self.first_drifted)

@@ -257,7 +257,7 @@ def _may_move_otherwise(solution: Solution) -> bool:
     if changes is None or found is None or not int(found.count):
         return False
     last = int(np.isfinite(np.asarray(solution.q)).all((1, 2)).sum()) - 1
-    of_scene = np.arange(changes.holds.shape[1]) < changes.of_scene
+    of_scene = np.arange(changes.holds.shape[1]) < changes.scene_constraint_count
     is_late = np.asarray(found.time) > solution.ts[max(last, 0)]
     return last < 0 or bool(is_late.any() or (np.asarray(changes.holds)[last] != of_scene).any())
 

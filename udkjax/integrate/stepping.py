@@ -157,7 +157,7 @@ def _advance(
     compiled = compile_mechanism(moved, analysis, *choices.of_mechanism)
     run = prepare_run(compiled, analysis, ts, state, None, choices)
     raw = differentiable(replace(run.problem, points=STORED_POINTS), has_fixed_times)
-    good = stop_gradients(run.is_usable & raw.reached[-1] & jnp.isinf(raw.lost))
+    good = stop_gradients(run.is_usable & raw.reached[-1] & jnp.isinf(raw.first_drifted))
     failed = jnp.where(good, 0.0, jnp.nan)  # added, since `where` would store one more array for reverse mode
     return State(*(defined(jnp.add)(y[-1], failed).reshape(np.shape(state.q)) for y in (raw.q, raw.v)))
 

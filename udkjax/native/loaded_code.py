@@ -30,7 +30,7 @@ from udkjax.threads import shared_threads, thread_count
 
 CODE_BYTES = 1.4  # memory of loaded code, with the programs of its scene, for each character of the text
 QUICK_MEMBERS = 16  # maximum number of members of a call by quickly compiled code
-QUICK_STEPS = 4_000  # maximum number of steps of all its members, 20 ms
+QUICK_STEPS = 4_000  # maximum number of steps of all members of such a call together, some 20 ms
 QUICK_SECONDS_OF_LINE = 2e-6  # total time of such calls per line of text: a tenth of its compile time
 TIMES_INPUT, BREAKS_INPUT = INPUTS.index("ts"), INPUTS.index("breaks")
 FEW_MEMBERS = 2  # maximum number of members that run one after another: eight lanes take as long as two members

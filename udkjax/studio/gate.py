@@ -1,8 +1,9 @@
-"""The gate of the server: checks of every request, and security headers of every answer.
+"""The gate of the server: checks of every request, and security headers of every response.
 
-A page of another site can reach a server on this machine in three ways: through a host name that it points here (so Host is
-checked), through requests from its scripts (so Origin is checked, and the body must be JSON, which no form sends), and by guesses
-(so each request to the interface needs a random token, which is in the fragment of the address, which browsers never send).
+A page of another site can reach a server on this machine in three ways: by DNS rebinding, a host name that it points here (so
+Host is checked); by requests from its scripts or forms, CSRF (so Origin is checked, and the body must be JSON, which no form
+sends); and by guesses (so each request to the interface needs a random token, in the fragment of the address, which browsers
+never send).
 """
 
 import hmac

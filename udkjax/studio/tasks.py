@@ -171,7 +171,7 @@ def engine_of(mechanism: Mechanism, document: JsonObject) -> JsonObject:
 
 
 def _by_coordinates(mechanism: Mechanism) -> Mechanism:
-    """Return the mechanism of a drawing with all pins given by coordinates, which the page sends for pins of any form."""
+    """Return the mechanism of a drawing with all pins given by coordinates, as the page sends them however they were drawn."""
     assert isinstance(mechanism.drawing, Drawing)
     return mechanism.drawing.by_coordinates().mechanism()
 

@@ -60,8 +60,8 @@ class DesignProblem:
                 ["goal: a CurveGoal needs a driver that turns: leave rotation out, or give a PathGoal"], mechanism.name
             )
         self.shifted = goal.start == "free" and goal.values is not None
-        self.unknowns = free.count + self.shifted + goal.extras
-        self.coordinates = 3 * len(mechanism.body_names)
+        self.unknown_count = free.count + self.shifted + goal.extras
+        self.coordinate_count = 3 * len(mechanism.body_names)
         self.local = goal.values is None  # the driver's values are unknowns
         self._aim(goal, bounds)
         self.terms = self._compile_terms(terms)
@@ -72,7 +72,7 @@ class DesignProblem:
         """Set the goal with its targets, and the ranges and scales of unknowns that depend on the goal."""
         self.goal, self.data, self.scale = goal, goal.targets, goal_scale(goal, self.mechanism)
         length = self.scale if goal.has_place else float(self.driven.analysis.scales.length)
-        self._unit = np.tile([length, length, 1.0], self.coordinates // 3)
+        self._unit = np.tile([length, length, 1.0], self.coordinate_count // 3)
         wide = np.full(int(self.shifted), np.inf)
         low, high = (np.full(goal.extras, end) for end in goal.bounds_of_extras)
         self.low, self.high = np.concatenate([bounds.low, -wide, low]), np.concatenate([bounds.high, wide, high])
@@ -100,7 +100,7 @@ class DesignProblem:
                 )
                 raise SceneError([problem], self.mechanism.name)
             span = float(goal.values[0]), float(goal.values[-1])
-        where = {"unit": self._unit, "scale": self.scale, "span": span, "unknowns": self.unknowns}
+        where = {"unit": self._unit, "scale": self.scale, "span": span, "unknown_count": self.unknown_count}
         where |= {"origin": goal.origin, "shifted": self.shifted}
         base = self.mechanism, self.free, self.driver, self.driven
         return [
@@ -118,12 +118,12 @@ class DesignProblem:
 
         D, rows = self.data.shape[1], np.asarray(self.driven.analysis.scales.rows)
         model = position_model(self.free, self.driver, measures, goal.origin, self.shifted)
-        traced = trace_model(model, self.unknowns, self.coordinates, D)
+        traced = trace_model(model, self.unknown_count, self.coordinate_count, D)
         G = len(goal.residual(np.zeros(self.data.shape), self.data, np.zeros((1, goal.extras)), np))
 
         def made(chosen, derivatives):
             choices = {"data": D, "derivatives": derivatives, "rows": rows, "chosen": chosen}
-            return compile_positions(self.mechanism, traced, self.unknowns, self.coordinates, **choices)
+            return compile_positions(self.mechanism, traced, self.unknown_count, self.coordinate_count, **choices)
 
         self._made, self._residual_count = made, G
         self._fit, self._fit_code = made(slice(G), True)
@@ -166,9 +166,9 @@ class DesignProblem:
         graph = Graph()
         x, q = (
             np.array([graph.input((n, k), n) for k in range(c)], object)
-            for n, c in (("x", self.unknowns), ("q", self.coordinates))
+            for n, c in (("x", self.unknown_count), ("q", self.coordinate_count))
         )
-        traced = trace(points, jnp.zeros(self.unknowns), jnp.zeros(self.coordinates))(graph, x, q)[0]
+        traced = trace(points, jnp.zeros(self.unknown_count), jnp.zeros(self.coordinate_count))(graph, x, q)[0]
         return ScalarProgram(graph, [*x, *q], list(traced.flat))
 
     # --- single mechanisms
@@ -304,13 +304,13 @@ class DesignProblem:
         x, (members, J) = trials.x, trials.s.shape
         solved = self._fit_code(x, trials.s, self._unit, self.data, trials.q, threads=threads)
         G = len(self._fit.places) - 1
-        table = solved.out.reshape(members, J, G + 1, 2 + self.unknowns)
+        table = solved.out.reshape(members, J, G + 1, 2 + self.unknown_count)
         r, by_value, by_unknowns, rest = self.goal.combine(table[:, :, :G, 0], table[:, :, :G, 1], table[:, :, :G, 2:])
         limits, slopes = self.lengths(x)
         exists, tau = np.isfinite(solved.end).all(1), table[:, :, G, 0]
         if self.rotation:
             which = exists if worth is None else exists & worth(np.einsum("mjg,mjg->m", r, r) + rest, limits)
-            turns, more, more_slopes = np.zeros(members, bool), np.zeros((members, 1)), np.zeros((members, 1, self.unknowns))
+            turns, more, more_slopes = np.zeros(members, bool), np.zeros((members, 1)), np.zeros((members, 1, self.unknown_count))
             more[which], more_slopes[which], turns[which] = self._turn_limit(x[which], margin[which], threads)
             limits, slopes = np.concatenate([limits, more], 1), np.concatenate([slopes, more_slopes], 1)
             exists &= turns
@@ -328,7 +328,7 @@ class DesignProblem:
     def _terms_of(self, x: np.ndarray, exists: np.ndarray, threads: int | None) -> tuple[np.ndarray, np.ndarray]:
         """Return the residuals of motion goals and their derivatives; `exists` becomes False for trials without a motion."""
         count = sum(term.goal.samples for term in self.terms)
-        r, by_unknowns, start = np.zeros((len(x), count)), np.zeros((len(x), count, self.unknowns)), 0
+        r, by_unknowns, start = np.zeros((len(x), count)), np.zeros((len(x), count, self.unknown_count)), 0
         for term in self.terms:
             which, columns = np.flatnonzero(exists), slice(start, start + term.goal.samples)
             r[which, columns], by_unknowns[which, columns], exists[which] = term(x[which], threads)

@@ -1,4 +1,4 @@
-"""Motion goals: limits on torques, loads of joints, energies, frequencies and tolerances, in addition to a positional goal.
+"""Motion goals: limits on torques, loads of joints, energies, frequencies, gaps and tolerances, beside a positional goal.
 
 Each goal measures positions of a motion with a constant rate of the driver, over the whole turn if there is one, otherwise over
 the range of the positional goal's values. A measure m above `most` adds the residual weight scale (m / most - 1), a measure below

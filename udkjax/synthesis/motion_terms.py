@@ -43,7 +43,7 @@ class CompiledTerm:
         unit: scales of the coordinates (n,).
         scale: scale of the residuals.
         span: first and last value of the driver, as in the positional goal; None: a whole turn.
-        unknowns: number of unknowns.
+        unknown_count: number of unknowns.
         origin: the driver's value from which the goal's values are measured.
         shifted: whether the unknown after the free numbers is added to the origin.
     """
@@ -58,7 +58,7 @@ class CompiledTerm:
         unit: np.ndarray,
         scale: float,
         span: tuple[float, float] | None,
-        unknowns: int,
+        unknown_count: int,
         origin: Callable[[Mechanism], Array],
         shifted: bool,
     ):
@@ -93,8 +93,8 @@ class CompiledTerm:
         n = mechanism.q0.size
         programs, self._code = compile_positions(
             mechanism,
-            trace_model(base, unknowns, n, D),
-            unknowns,
+            trace_model(base, unknown_count, n, D),
+            unknown_count,
             n,
             data=D,
             transmission=False,

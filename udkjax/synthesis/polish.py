@@ -49,7 +49,7 @@ def _newton_step(
     usable = np.isfinite(H).all((1, 2))
     H = np.where(usable[:, None, None], H, np.eye(H.shape[1]))
     slopes = np.zeros((*pressed.shape, len(units)))
-    slopes[..., : problem.unknowns] = found.limits_by_unknowns
+    slopes[..., : problem.unknown_count] = found.limits_by_unknowns
     slopes *= units
     for _ in range(ACTIVE_SETS):
         dz = _downhill(problem, trials, H, g, shift[active])
@@ -85,8 +85,9 @@ def _newton_step(
 def _downhill(problem: DesignProblem, trials: Trials, H: np.ndarray, g: np.ndarray, shift: np.ndarray) -> np.ndarray:
     """Return the steps dz (M, N) of trials by their Hessians H, gradients g and shifts; unknowns at bounds may be fixed."""
     fixed = np.zeros(g.shape, bool)
-    of_x = g[:, : problem.unknowns]
-    fixed[:, : problem.unknowns] = ((trials.x <= problem.low) & (of_x > 0)) | ((trials.x >= problem.high) & (of_x < 0))
+    gradient_x = g[:, : problem.unknown_count]
+    at_low, at_high = trials.x <= problem.low, trials.x >= problem.high
+    fixed[:, : problem.unknown_count] = (at_low & (gradient_x > 0)) | (at_high & (gradient_x < 0))
     values, V = np.linalg.eigh(np.where(fixed[:, :, None] | fixed[:, None, :], 0.0, H))
     size = np.maximum(np.abs(values).max(1), 1e-300)
     components = np.einsum("mki,mk->mi", V, np.where(fixed, 0.0, g)) / (np.abs(values) + (shift * size)[:, None])
@@ -95,7 +96,7 @@ def _downhill(problem: DesignProblem, trials: Trials, H: np.ndarray, g: np.ndarr
 
 def _join(problem: DesignProblem, trials: Trials) -> tuple[np.ndarray, np.ndarray]:
     """Return all unknowns of the trials, z = (x, s) (M, N), and their units (N,)."""
-    units = np.ones(problem.unknowns)
+    units = np.ones(problem.unknown_count)
     units[: problem.free.count] = problem.sizes
     if not problem.local:
         return trials.x, units
@@ -103,8 +104,8 @@ def _join(problem: DesignProblem, trials: Trials) -> tuple[np.ndarray, np.ndarra
 
 
 def _split(problem: DesignProblem, z: np.ndarray, trials: Trials) -> Trials:
-    x = np.clip(z[:, : problem.unknowns], problem.low, problem.high)
-    return Trials(x, z[:, problem.unknowns :] if problem.local else problem.values_at(x, trials.s), trials.q)
+    x = np.clip(z[:, : problem.unknown_count], problem.low, problem.high)
+    return Trials(x, z[:, problem.unknown_count :] if problem.local else problem.values_at(x, trials.s), trials.q)
 
 
 def _gradient(
@@ -130,8 +131,8 @@ def _hessian(
     moves = DIFFERENCE_STEP * np.concatenate([np.diag(units), -np.diag(units)])  # (2 N, N)
     moved = (z[:, None] + moves).reshape(-1, N)
     repeated = Trials(*(np.repeat(a, 2 * N, 0) for a in trials))
-    x = moved[:, : problem.unknowns]
-    split = Trials(x, moved[:, problem.unknowns :] if problem.local else problem.values_at(x, repeated.s), repeated.q)
+    x = moved[:, : problem.unknown_count]
+    split = Trials(x, moved[:, problem.unknown_count :] if problem.local else problem.values_at(x, repeated.s), repeated.q)
     u, weight, margin, pressed = (np.repeat(a, 2 * N, 0) for a in limits)
     moved_trials = problem.evaluate(split, margin, threads)
     g = _gradient(problem, moved_trials, u, weight, pressed) * units

@@ -164,10 +164,12 @@ class RobustTerm(CompiledTerm):
 
     goal: RobustGoal
 
-    def __init__(self, goal: RobustGoal, mechanism: Mechanism, free: FreeNumbers, *where: Any, unknowns: int, **further: Any):
+    def __init__(
+        self, goal: RobustGoal, mechanism: Mechanism, free: FreeNumbers, *where: Any, unknown_count: int, **further: Any
+    ):
         self._pieces, self._numbers = MadePieces(free, goal.tolerances), free.count
         K = len(self._pieces.kurtosis)
-        super().__init__(goal, mechanism, self._pieces, *where, unknowns=unknowns + K, **further)  # pyright: ignore
+        super().__init__(goal, mechanism, self._pieces, *where, unknown_count=unknown_count + K, **further)  # pyright: ignore
         self._points = []
         model = quadratic(self._note, K)
         first, second = np.triu_indices(K, 1)

@@ -28,7 +28,7 @@ class _Fitted(NamedTuple):
 
 def find_starts(problem: DesignProblem, count: int, samples: int, rng: np.random.Generator, threads: int | None = None) -> Trials:
     """Return the `count` best of `samples` random mechanisms as trials; fewer if fewer have all positions."""
-    x = np.zeros((samples, problem.unknowns))
+    x = np.zeros((samples, problem.unknown_count))
     x[:, : problem.free.count] = rng.uniform(problem.first, problem.last, (samples, problem.free.count))
     turn = problem.turn(x, TURN_VALUES, threads)
     reached = turn.reached.all(1) & (np.abs(turn.transmission).min(1) > LEAST_TRANSMISSION)
@@ -36,7 +36,7 @@ def find_starts(problem: DesignProblem, count: int, samples: int, rng: np.random
     if problem.rotation or in_order:
         x, turn = x[reached], Turn(*(a[reached] for a in turn))
     if not len(x):
-        return Trials(x, np.zeros((0, len(problem.data))), np.zeros((0, len(problem.data), problem.coordinates)))
+        return Trials(x, np.zeros((0, len(problem.data))), np.zeros((0, len(problem.data), problem.coordinate_count)))
     (s, moved), cost = _assign(problem, x, turn) if in_order else _shift(problem, x, turn)
     if problem.goal.is_combined:
         s, moved = _spread(problem, s, moved)

@@ -79,7 +79,7 @@ class FrictionElimination:
             "new_drag": layout.coordinate_count,
         }
         layout.add_solve(CORRECTION_SOLVE)
-        layout.sizes["settled"] = layout.sizes[f"x{CORRECTION_SOLVE}"]
+        layout.sizes["settled"] = layout.sizes[f"x{CORRECTION_SOLVE}"]  # the latest x that has settled
         layout.sizes["friction_share"] = 1
 
     # --- programs

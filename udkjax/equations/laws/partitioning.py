@@ -46,11 +46,11 @@ PARTITION_NEWTON = NewtonLimits()
 class CoordinatePartitioning(Formulation):
     """Integrate only the independent coordinates and velocities; solve the constraints for the dependent ones at each stage.
 
-    The partition is chosen at the start of every step, by QR of D with column pivoting, and fixed for that step, so its condition
-    is never worse than that of the mechanism. Dependent coordinates serve only as the initial guess of Newton's method and do not
-    enter the error estimate. If Newton's method does not converge at a stage, or ends farther than 0.3 rad, or 0.3 characteristic
-    lengths, from that guess, the stage is NaN and a shorter step is taken. So the constraints hold wherever the equations are
-    evaluated: `Baumgarte` is refused, and `Projection` changes nothing.
+    The partition is chosen at the start of every step, by QR of D with column pivoting, and fixed for that step, so the columns
+    of the dependent coordinates are well conditioned wherever D is. Dependent coordinates serve only as the initial guess of
+    Newton's method and do not enter the error estimate. If Newton's method does not converge at a stage, or ends farther than 0.3
+    rad, or 0.3 characteristic lengths, from that guess, the stage is NaN and a shorter step is taken. So the constraints hold
+    wherever the equations are evaluated: `Baumgarte` is refused, and `Projection` changes nothing.
 
     Redundant rows are satisfied in the sense of least squares. In a singular configuration, where the remaining columns of D are
     shorter than `rank_tol` times the longest, a step has more independent coordinates, which later steps constrain again: runs of

@@ -120,8 +120,8 @@ class SparseRows(RowTerms, PositionRows[SparsePosition]):
 
     def at(self, t: Time, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, SparseMatrix]:
         psi, _, values = self.geometry(t, q, q)
-        D, length = self._normalize_rows(values)
-        return psi, length, D
+        D, row_lengths = self._normalize_rows(values)
+        return psi, row_lengths, D
 
     def dense(self, matrix: SparseMatrix) -> np.ndarray:
         return matrix.toarray()
@@ -141,10 +141,10 @@ class SparseRows(RowTerms, PositionRows[SparsePosition]):
         return residual if self.balance is None else residual / self.balance.rows
 
     def correction(self, t: Time, q: np.ndarray) -> np.ndarray:
-        psi, length, D = self.at(t, q)
-        return self._solve(D, psi / length)
+        psi, row_lengths, D = self.at(t, q)
+        return self._correction_for(D, psi / row_lengths)
 
-    def _solve(self, D: SparseMatrix, residual: np.ndarray) -> np.ndarray:
+    def _correction_for(self, D: SparseMatrix, residual: np.ndarray) -> np.ndarray:
         """Return -W D^T (D D^T + damping)^(-1) residual."""
         if not np.all(np.isfinite(D.data)):
             return np.full(self.size, np.nan)
@@ -162,13 +162,15 @@ class SparseRows(RowTerms, PositionRows[SparsePosition]):
         if not self.count:
             return q, v, np.zeros(0), np.zeros(0), 0
         q = close_position(self, t, q, np)
-        psi, length, D = self.at(t, q)
+        psi, row_lengths, D = self.at(t, q)
         if not np.all(np.isfinite(D.data)):
             return q, v, psi, psi, 0
         rank = self._position(t, q, D).rank
         for _ in range(CLOSURE.velocities + 1):  # the damped first correction is not exact
-            v = v + self._solve(D, self.geometry(t, q, v)[1] / length)
-        return q, v, psi, self.geometry(t, q, v)[1], rank
+            _, psi_dot, _ = self.geometry(t, q, v)
+            v = v + self._correction_for(D, psi_dot / row_lengths)
+        _, psi_dot, _ = self.geometry(t, q, v)
+        return q, v, psi, psi_dot, rank
 
     def split_rows(self, positions: list[SparsePosition]) -> Sequence[tuple[np.ndarray, Sequence["RowSubset"]]]:
         return split_dependent_rows(positions)

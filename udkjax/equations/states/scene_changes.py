@@ -47,7 +47,7 @@ class SceneChanges(eqx.Module):
     form: "_Form | None" = eqx.field(static=True)  # the structure of added joints, contacts and their friction; None: unknown
     names: tuple[str, ...] = eqx.field(static=True)  # the names of the constraints in the mechanism with all of them
     public: tuple[str, ...] = eqx.field(static=True)  # the names by which results list them
-    of_scene: int = eqx.field(static=True)  # number of the constraints that belong to the scene
+    scene_constraint_count: int = eqx.field(static=True)  # number of the constraints that belong to the scene
     sticking: tuple[str, ...] = eqx.field(static=True, default=())  # the names of contacts with friction in `Solution.sticking`
 
     @property
@@ -85,7 +85,7 @@ class SceneChanges(eqx.Module):
     @staticmethod
     def write(changes: "SceneChanges | None", data: Any) -> None:
         """Add `holds`, over time and constraint, to the xarray Dataset of a run; None: the run has not changed the scene."""
-        data.attrs[OF_SCENE] = -1 if changes is None else changes.of_scene
+        data.attrs[OF_SCENE] = -1 if changes is None else changes.scene_constraint_count
         if changes is not None:
             data["holds"] = ("time", "constraint"), np.asarray(changes.holds).astype(np.int8)
             data.coords["constraint"] = list(changes.public)
@@ -99,19 +99,19 @@ class SceneChanges(eqx.Module):
             data: The dataset. If `write` has added nothing, an older version has written it.
             had_events: True if its run had events.
         """
-        of_scene, times = int(data.attrs.get(OF_SCENE, 0 if had_events else -1)), len(data["time"])
-        if of_scene < 0:
+        scene_constraint_count, times = int(data.attrs.get(OF_SCENE, 0 if had_events else -1)), len(data["time"])
+        if scene_constraint_count < 0:
             return None
         holds, names = np.ones((times, 1), bool), ("",)  # something has changed
         if "holds" in data.variables:
             holds, names = np.asarray(data["holds"]) > 0, tuple(map(str, data["constraint"].values))
-        return cls(holds, np.zeros((times, 0, 0)), (), None, names, names, of_scene)
+        return cls(holds, np.zeros((times, 0, 0)), (), None, names, names, scene_constraint_count)
 
     def scene(self, mechanism: Mechanism) -> Mechanism:
         """Return the mechanism with all constraints of the run, those that events change with a switch."""
         joints, friction = self.elements
-        known = [name for name in self.names[: self.of_scene] if name in mechanism.constraints]
-        others = dict(zip(self.names[self.of_scene :], joints, strict=False))
+        known = [name for name in self.names[: self.scene_constraint_count] if name in mechanism.constraints]
+        others = dict(zip(self.names[self.scene_constraint_count :], joints, strict=False))
         if is_concrete(mechanism, *joints, *friction.values()):
             return _concrete_scene(mechanism, tuple(known), tuple(others), tuple(friction), *joints, *friction.values())
         return with_switches(mechanism, known, others, friction)
@@ -119,27 +119,27 @@ class SceneChanges(eqx.Module):
     def constraints_of(self, mechanism: Mechanism) -> dict[str, list[str]]:
         """Return the names of the constraints of `scene`, listed by their names in results; the mechanism's own come first."""
         found = {name: [name] for name in mechanism.constraints}
-        for name, public in list(zip(self.names, self.public, strict=True))[self.of_scene :]:
+        for name, public in list(zip(self.names, self.public, strict=True))[self.scene_constraint_count :]:
             found.setdefault(public, []).append(name)
         return found
 
     def rows_that_hold(self, mechanism: Any) -> Bool[Array, "T m"]:
         """Return a mask over output times and rows of a mechanism: True where the constraint of the row holds."""
-        own = self.names[: self.of_scene]
+        own = self.names[: self.scene_constraint_count]
         owners = [name for name, _ in analyse(mechanism).row_names]
-        places = np.array([own.index(name) if name in own else self.of_scene for name in owners], int)
+        places = np.array([own.index(name) if name in own else self.scene_constraint_count for name in owners], int)
         always = jnp.ones((len(self.holds), 1), bool)
-        return jnp.concatenate([self.holds[:, : self.of_scene], always], axis=1)[:, places]
+        return jnp.concatenate([self.holds[:, : self.scene_constraint_count], always], axis=1)[:, places]
 
     @property
     def are_released(self) -> Bool[Array, "T"]:
         """A mask of the output times at which a constraint of the scene is released."""
-        return ~jnp.all(self.holds[:, : self.of_scene], axis=1)
+        return ~jnp.all(self.holds[:, : self.scene_constraint_count], axis=1)
 
     @property
     def is_unknown(self) -> Bool[Array, "T"]:
         """A mask of the output times at which an added joint or a contact holds whose numbers are not known."""
-        return jnp.any(self.holds[:, self.of_scene :], axis=1) & (not self.is_known)
+        return jnp.any(self.holds[:, self.scene_constraint_count :], axis=1) & (not self.is_known)
 
 
 class _Form(NamedTuple):
@@ -224,7 +224,7 @@ class Knowledge(NamedTuple):
             return KnownState(self.sticking, driven=self.driven, driver=self.driver)
         known = [k for k, name in enumerate(changes.names) if name in mechanism.constraints]
         count = changes.places.shape[1] if changes.is_known else 0
-        joints, names = changes.elements[0][:count], changes.names[changes.of_scene :][:count]
+        joints, names = changes.elements[0][:count], changes.names[changes.scene_constraint_count :][:count]
 
         def numbers(joint: Joint, q: Array) -> tuple[Array, ...]:
             frames = rubbing.frames(mechanism, q, jnp.zeros_like(q))

@@ -256,11 +256,14 @@ class GeneralEquations(ConstrainedRows):
             dv = dv - weight(plus @ rates)
         return TangentPart(dq, dv)
 
-    def impulse(self, t: Time, q: Vector, v: Vector, normal: Vector) -> tuple[Vector, Vector]:
-        """Return M^(-1) n for n = `normal`, and its tangent part: the change of velocities by a unit impulse along n."""
+    def unit_impulse_response(self, t: Time, q: Vector, v: Vector, normal: Vector) -> tuple[Vector, Vector]:
+        """Return the changes of velocities by a unit impulse along n = `normal`: M^(-1) n, and its tangent part.
+
+        The first is that of the unconstrained system, the second obeys the constraints.
+        """
         factor = jax.scipy.linalg.cho_factor(jnp.asarray(self.mechanism.mass(q)), lower=True)
-        mobility = jax.scipy.linalg.cho_solve(factor, normal)
-        return mobility, self.tangent_part(t, q, v, jnp.zeros_like(q), mobility).dv
+        change = jax.scipy.linalg.cho_solve(factor, normal)
+        return change, self.tangent_part(t, q, v, jnp.zeros_like(q), change).dv
 
     def energy(self, t: Time, q: Vector, v: Vector) -> tuple[Array, Array]:
         """Return the kinetic energy v^T M v / 2 and the potential energy V, zero without a potential."""

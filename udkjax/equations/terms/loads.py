@@ -42,7 +42,7 @@ def mass_of(mechanism: Mechanism, xp: ArrayLibrary) -> NumericArray:
 
 @traced_once
 def force(mechanism: Mechanism, t: NumberLike, q: BodyArray, v: BodyArray) -> Float[Array, "n"]:
-    """Return F = -V_q + the loads of force elements.
+    """Return F = -V_q + the loads of force elements, without friction that depends on the loads of joints.
 
     Args:
         mechanism: The scene.

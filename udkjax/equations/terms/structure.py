@@ -30,7 +30,7 @@ Structure: TypeAlias = tuple[TreeDef, LeafShapes]
 
 
 class RubbingJoint(eqx.Module):
-    """A joint, and the friction of this joint that depends on its load; both without the names of bodies and joints.
+    """A joint, and the friction of this joint that depends on its load. The names of bodies and joints are removed from both.
 
     Args:
         bodies: the names of the bodies of the joint.

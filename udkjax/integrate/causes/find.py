@@ -28,6 +28,10 @@ class FoundCause:
 
     All instances compare equal, so all solutions have the same tree structure. A solution may thus hold the cause of another
     run; the cause is returned only for the code and time of the run it was found for.
+
+    Args:
+        run: the failed run; None if `text` is known.
+        text: the cause; None if it is to be found when it is asked for.
     """
 
     def __init__(self, run: FailedRun | None, text: str | None = None):

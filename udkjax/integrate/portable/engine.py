@@ -119,7 +119,7 @@ def portable_engine(
         modules["mark"] = _operation(MarkRows(scene_programs(scene).with_all_rows))
     if runs and operation is not None:
         modules |= _run_modules(operation, problem, data, watched, scene)
-        if data["sampled"] and any(0 <= k - numbers.count < numbers.knots for k in numbers.changing):
+        if data["sampled"] and any(0 <= k - numbers.count < numbers.knots for k in numbers.changing_numbers):
             raise ValueError("parameters move breakpoints of a scene that has samples: leave out those of its motion laws")
     code = scene_programs(scene, analysis.redundant_rows) if operation is None else operation.code
     modules["evaluate"] = _evaluation(mechanism, scene, code, numbers, data)

@@ -40,7 +40,7 @@ from udkjax.integrate.events.run.phase_code import ValuesLayout
 
 # The parts of a run that an instant changes, `joints` one after another; and of its record only what the next event needs.
 CHANGED_FIELDS = "t q v phase joints event sides scale carried running code undefined".split()
-LAST_EVENT_FIELDS = "event_time", "event_index", "closed"
+LAST_EVENT_FIELDS = "event_time", "event_index", "contact_state"
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class Instants:
         numbers = sum(len(joint.program.inputs) - n for joint in self.added)
         of_state = {"t": (), "q": (n,), "v": (n,), "phase": (C,), "joints": (sum(self.widths),), "event": (), "sides": (2 * E,)}
         of_state |= {"scale": (E,), "carried": (E,), "running": (), "code": (), "undefined": (E,)}
-        of_state |= {f"last_{name}": (E,) if name == "closed" else () for name in LAST_EVENT_FIELDS}
+        of_state |= {f"last_{name}": (E,) if name == "contact_state" else () for name in LAST_EVENT_FIELDS}
         constant = {"end": (), "rate": (), "coordinates": (n,), "inverse_mass": (n,)}
         return of_state | constant | {"of_actions": (len(NUMBERS_OF_ACTIONS), E), "joint_numbers": (numbers,)}
 

@@ -46,7 +46,7 @@ class NumberProgram:
 
     Attributes:
         base: the present values of all numbers.
-        changing: indices of the numbers that depend on the parameters.
+        changing_numbers: indices of the numbers that depend on the parameters.
         count: number of the numbers before the breakpoints.
         knots: number of breakpoints.
     """
@@ -77,12 +77,12 @@ class NumberProgram:
         known = parts(mechanism)
         self.base = np.concatenate(known)
         self.count, self.knots = (len(x) for x in known[:2])
-        self._numbers, self._parameters = numbers, len(values)
-        self._program, self.changing = traced_program(numbers, len(values))
+        self._numbers, self._parameter_count = numbers, len(values)
+        self._program, self.changing_numbers = traced_program(numbers, len(values))
 
     def function(self) -> Function:
         """Return the machine code of `numbers(parameters, numbers)`, which writes the numbers that depend on the parameters."""
-        return vector_function(self._program, "numbers", "parameters", "numbers", self.changing)
+        return vector_function(self._program, "numbers", "parameters", "numbers", self.changing_numbers)
 
     def function_along(self) -> Function:
         """Return the machine code of `numbers_along(parameters, numbers)`, which writes the changes of these numbers.
@@ -91,15 +91,15 @@ class NumberProgram:
         """
 
         def along(x: Array) -> Array:
-            return jax.jvp(self._numbers, (x[: self._parameters],), (x[self._parameters :],))[1]
+            return jax.jvp(self._numbers, (x[: self._parameter_count],), (x[self._parameter_count :],))[1]
 
-        program, changing = traced_program(along, 2 * self._parameters)
-        return vector_function(program, "numbers_along", "parameters", "numbers", changing)
+        program, changing_outputs = traced_program(along, 2 * self._parameter_count)
+        return vector_function(program, "numbers_along", "parameters", "numbers", changing_outputs)
 
     def __call__(self, values: Sequence[float]) -> Float[np.ndarray, "numbers"]:
         """Return all numbers for these values of the parameters, by NumPy."""
         numbers = self.base.copy()
-        numbers[self.changing] = [float(x) for x in self._program([float(x) for x in values])]
+        numbers[self.changing_numbers] = [float(x) for x in self._program([float(x) for x in values])]
         return numbers
 
 
@@ -110,8 +110,8 @@ def traced_program(function: Callable[[Array], Array], count: int) -> tuple[Scal
     if count:
         (found,) = trace(function, jax.ShapeDtypeStruct((count,), jnp.result_type(float)))(graph, np.array(inputs, object))
         outputs = list(found)
-    changing = [k for k, s in enumerate(outputs) if s.constant is None]
-    return ScalarProgram(graph, inputs, [outputs[k] for k in changing]), changing
+    changing_outputs = [k for k, s in enumerate(outputs) if s.constant is None]
+    return ScalarProgram(graph, inputs, [outputs[k] for k in changing_outputs]), changing_outputs
 
 
 def places_of_numbers(mechanism: Mechanism) -> Mechanism:

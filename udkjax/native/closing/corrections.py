@@ -63,7 +63,7 @@ class LeastNormCorrection:
                 module.places.add(f"change {name}", size)
 
     def place(self, name: str) -> int:
-        """Return the offset of an array in `stored`."""
+        """Return the offset of an array in `stored`, in numbers: "q1" or "v1" (the corrected x), "z" or "y"."""
         return {f"{self._x}1": 0, "z": self._module.n, "y": 2 * self._module.n}[name]
 
     def find_rank(self, f: Function):

@@ -7,9 +7,10 @@ the tangents of the stages are the sums
 
 and the tangents of the accelerations, the end of a step and the projected outputs come from the programs of derivatives
 (expressions/algebra/differential.py), which need intermediate results of the evaluation. Interpolation is linear. A stage of an
-implicit method is the solution of a_i = a(t_i, Q_i + h^2 g^2 a_i, V_i + h g a_i) (stage_equations.py), so that
+implicit method is the solution of a_i = a(t_i, Q_i + h^2 g^2 a_i, V_i + h g a_i) (stage_equations.py), where Q_i and V_i
+are the state of the stage without its own a_i, so that
 
-    D da_i = a_q dQ_i + a_v dV_i + a_p dp.
+    (I - h^2 g^2 a_q - h g a_v) da_i = a_q dQ_i + a_v dV_i + a_p dp.
 """
 
 from collections.abc import Iterator, Sequence

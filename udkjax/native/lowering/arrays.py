@@ -33,12 +33,12 @@ def base_of(dtype: Any) -> str:
 
 
 class Array:
-    """An array of one member.
+    """An array of a lowered function, without an axis of lanes: each lane has a member, with an array of its own.
 
     Args:
         shape: The shape of the array.
         base: The base type of its elements.
-        varies: Whether elements may differ between lanes.
+        varies: Whether the arrays of lanes may differ.
         cost: The number of operations that reading an element takes.
     """
 

@@ -52,8 +52,8 @@ class RunArrays(Running):
             "result dq",
             "result dv",
             "corrected q",
-            "scale q",
-            "scale v",
+            "atol q",
+            "atol v",
             "inverse unit",
         ):
             p.add(name, n)

@@ -8,7 +8,7 @@ Arrays of coordinates in the memory of a run; q, v, a are positions, velocities 
     stage1 a ...         accelerations of the stages of a step
     difference0 ...      divided differences: the coefficients of the interpolating polynomial
     fallback a ...       results of fallback steps
-    scale q, v           absolute tolerances; `inverse unit` is one over the scene's unit of each coordinate
+    atol q, v            absolute tolerances; `inverse unit` is one over the scene's unit of each coordinate
     bar state q ...      cotangents of these arrays
 
 `constants` and the arrays of the scene's programs have the names of the programs; "stage1 linearization" etc. hold the

@@ -100,7 +100,7 @@ class Running(Memory):
         for name in ("length", "omega", "rtol", "atol", "smallest"):
             setattr(s, name, f.const(1.0, DOUBLE, width))
         with f.each(-(-self.n // max(self.plan.vector // width, 1)) * max(self.plan.vector // width, 1)) as i:
-            for name in ("scale q", "scale v"):
+            for name in ("atol q", "atol v"):
                 self.put_entry(f, name, i, 1.0)
 
     def _write_run(self):

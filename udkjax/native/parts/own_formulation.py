@@ -45,7 +45,7 @@ class OwnFormulationCode(FormulationCode):
     def evaluate(self, mass: Any, F: Any, A: Any, c: Any, numbers: Any) -> Any:
         """Return the accelerations (n,) that the user's `solve` computes, from the diagonal `mass` of M, F, A and c.
 
-        `numbers`: the numbers in the arrays of the formulation, one after another.
+        `numbers`: the numbers in the arrays of the formulation, one after another. Inputs "D" and "b" of `written` are A and c.
         """
         n = len(F)
         a = self.own.filled(numbers).solve(jnp.where(jnp.eye(n, dtype=bool), mass, 0.0), F, A, c)

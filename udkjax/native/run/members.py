@@ -37,8 +37,8 @@ def write_begin(module: Module):
         angle = f.arithmetic("sub", i, f.arithmetic("div", i, 3) * 3).is_(2)
         unit = f.select(angle, f.const(1.0), settings["length"])
         put("inverse unit", 1.0 / unit, i)
-        put("scale q", settings["atol"] * unit, i)
-        put("scale v", settings["atol"] * unit * settings["omega"], i)
+        put("atol q", settings["atol"] * unit, i)
+        put("atol v", settings["atol"] * unit * settings["omega"], i)
         for j in range(NODE_COUNT):
             put(f"point{j} q", f.load(q, i), i)
             put(f"point{j} v", f.load(v, i), i)

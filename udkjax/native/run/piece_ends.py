@@ -60,9 +60,9 @@ def moves_by_tolerance(module: Module, f: Function, s: Lane) -> Value:
     were not, rounding errors would make a mechanism at rest there step to and fro across the end for ever.
     """
     rtol = module.broadcast(f, s.rtol)
-    changes = [("point3 q", "corrected q", "scale q")]
+    changes = [("point3 q", "corrected q", "atol q")]
     if module.code.has_piecewise_loads:
-        changes.append(("point3 v", "result v", "scale v"))
+        changes.append(("point3 v", "result v", "atol v"))
 
     def ratios(r: Value) -> list[Value]:
         sizes = []

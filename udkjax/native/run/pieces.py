@@ -27,12 +27,12 @@ from udkjax.native.run.runge_kutta import stage_state
 class StepDecision(NamedTuple):
     """Decisions about a step that may end in another piece, each as a mask of lanes."""
 
-    stepping: Value
-    is_accurate: Value
+    stepping: Value  # the lane takes a step
+    is_accurate: Value  # its error is within its tolerance
     leaves: Value  # the step ends in another piece
-    repeats: Value  # it is therefore repeated
-    shortens: Value  # it is repeated since one of its stages is in another piece
-    turns: Value  # the load of an edge has another sign
+    repeats: Value  # the step is repeated since it ends in another piece
+    shortens: Value  # the step is repeated since one of its stages is in another piece
+    turns: Value  # the load of a rolling edge has another sign at the end than at the beginning
 
 
 def write_end_piece(module: Module):

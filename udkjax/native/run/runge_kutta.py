@@ -10,10 +10,10 @@ from udkjax.native.module.tableau import Method
 
 
 def write_attempt(module: Module):
-    """Write `attempt(work)`: take a step from point 3 to `t1`, of length `step`, in lanes that are `stepping`.
+    """Write `attempt(work)`: take a step of length `step` to `t1`, in lanes that are `stepping`.
 
-    The state at `t1` becomes `state q`, `result v` and `result a`. `error` is the error of the step relative to its tolerance,
-    `distance` the distance from singular configurations.
+    It begins at point 3, the latest accepted state. The state at `t1` becomes `state q`, `result v` and `result a`. `error` is
+    the error of the step relative to its tolerance, `distance` the distance from singular configurations.
     """
     module.stiffness.write_measurement()
     f, s = module.function("attempt")
@@ -62,7 +62,7 @@ def _measure_error(module: Module, f: Function, s: Lane):
     # Comparisons ignore NaN, so non-finite numbers are detected by their product with zero.
     check, error, tolerance = (f.variable(x, width=module.plan.vector) for x in (0.0, 0.0, 1.0))
     with f.each(module.rowcount) as r:
-        for d, scale, y0, y1 in (("dq", "scale q", q0, q1), ("dv", "scale v", v0, v1)):
+        for d, scale, y0, y1 in (("dq", "atol q", q0, q1), ("dv", "atol v", v0, v1)):
             tangent_error = module.vector(f, f"result {d}", r)
             if weight:
                 tangent_error = f.fma(module.vector(f, f"state {d}", r) - tangent_error, weight, tangent_error)

@@ -62,7 +62,7 @@ class _Modes:
         self._zero, self._one = (f.const(x, DOUBLE, f.width) for x in (0.0, 1.0))
 
     def pass_events(self, stops: Value, leaves: Value, sign: Value):
-        """Pass the events of lanes in which the decision about the modes is clear.
+        """Handle the events of lanes in which the decision about the modes is clear; restore the others, for Python to handle.
 
         `stops`: the lanes in which the joint of the event stops; `leaves`: those in which it leaves its lock, in the direction
         `sign`.

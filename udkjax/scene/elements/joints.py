@@ -57,7 +57,7 @@ class Constraint(PrintsLine):
     def piece(self, t: Number, *frames: Frame) -> Number | None:
         """Return the index of the current smooth piece of Psi, or None if it is smooth everywhere (the default).
 
-        Second derivatives of Psi are continuous where pieces meet. No interpolation crosses from one piece to another. If the
+        Second derivatives of Psi must be continuous where pieces meet. No interpolation crosses from one piece to another. If the
         index depends on t, runs have no second derivatives.
         """
         return None

@@ -74,7 +74,7 @@ def _is_allowed(node: ast.expr) -> bool:
 
 
 def names_in(text: str) -> tuple[str, ...] | None:
-    """Return the names of numbers in an expression, in order; None if the text is not one."""
+    """Return the names of numbers in an expression, each once, in order of appearance; None if the text is no expression."""
     tree = parse(text)
     if tree is None:
         return None

@@ -100,12 +100,12 @@ class Diagnosis(NamedTuple):
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything as plain numbers, lists and strings, for JSON; angles in rad."""
-        results, names, line = plain(self), self.mechanism.body_names, self.timeline
+        results, names, timeline = plain(self), self.mechanism.body_names, self.timeline
         for branch in results["branches"]:
             branch["tangent"] = dict(zip(names, branch["tangent"], strict=True))
-        if line is not None:
-            closest = dict(zip(("time", "smallest"), line.closest, strict=True))
-            results["timeline"] |= plain({"smallest": line.smallest, "closest": closest})
+        if timeline is not None:
+            closest = dict(zip(("time", "smallest"), timeline.closest, strict=True))
+            results["timeline"] |= plain({"smallest": timeline.smallest, "closest": closest})
         further = ("gruebler", "degrees_of_freedom", "mobility", "joint_mobility", "conditioning")
         return (
             results

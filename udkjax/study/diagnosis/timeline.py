@@ -78,7 +78,7 @@ def timeline(mechanism: StudyModel, solution: StateHistory, rank_tol: float, tol
     """
     changes = getattr(solution, "scene_changes", None)
     if changes is not None and np.any(changes.are_released):
-        names = ", ".join(quote(name) for name in changes.names[: changes.of_scene])
+        names = ", ".join(quote(name) for name in changes.names[: changes.scene_constraint_count])
         raise ArgumentError(f"solution: its events release {names}: give a run that ends before, or leave it out")
     solution = solution.in_order() if isinstance(solution, Kinematics) else solution
     analysis, unit = analysis_of(mechanism), getattr(solution, "unit", "s") or "s"

@@ -15,7 +15,7 @@ CLOSED_TOL = 1e-14  # relative to the longest vector: residuals of closed loops
 SAME_POSITION_TOL = 1e-9  # rad, or relative to the longest vector: differences of the same position
 
 
-class PositionRates(NamedTuple):
+class PositionMotion(NamedTuple):
     """The motion of one position: angles, and lengths along lines, each with its first and second derivative in time."""
 
     angles: dict[str, tuple[float, float, float]]  # rad, rad/s, rad/s^2
@@ -29,21 +29,21 @@ class NewtonStep(NamedTuple):
     residual: float
 
 
-def newton_steps(loops: Sequence[VectorLoop], rates: PositionRates) -> list[NewtonStep]:
-    """Return the steps of Newton's method, J d = -f for the changes d of the unknowns, to the position of `rates`.
+def newton_steps(loops: Sequence[VectorLoop], motion: PositionMotion) -> list[NewtonStep]:
+    """Return the steps of Newton's method, J d = -f for the changes d of the unknowns, to the position of `motion`.
 
     f are the components x and y of the closures, and J is the matrix of the velocities. The first step begins at a coarse
-    estimate of the position. If no estimate leads to it, there are no steps.
+    estimate of the position, of which only the angles and lengths are used. If no estimate leads to it, there are no steps.
     """
     names = [("angle", body) for loop in loops for body in loop.angles] + [("slide", s) for loop in loops for s in loop.slides]
-    goal = np.array([(rates.angles if kind == "angle" else rates.slides)[name][0] for kind, name in names])
+    goal = np.array([(motion.angles if kind == "angle" else motion.slides)[name][0] for kind, name in names])
     longest = max(abs(x.size) for loop in loops for x in loop.vectors)
     units = np.array([1.0 if kind == "angle" else longest for kind, _ in names])
     for halvings in range(HALVINGS):
         grain = ESTIMATE_GRAIN * units / 2**halvings
         x, steps = np.round(goal / grain) * grain, []
         for _ in range(MOST_STEPS):
-            f, J = _closures(loops, rates, dict(zip(names, x, strict=True)))
+            f, J = _closures(loops, motion, dict(zip(names, x, strict=True)))
             steps.append(NewtonStep(x.tolist(), float(np.max(np.abs(f)))))
             if np.max(np.abs(f)) <= CLOSED_TOL * longest or np.linalg.matrix_rank(J) < len(x):
                 break
@@ -54,12 +54,12 @@ def newton_steps(loops: Sequence[VectorLoop], rates: PositionRates) -> list[Newt
 
 
 def _closures(
-    loops: Sequence[VectorLoop], rates: PositionRates, unknowns: dict[tuple[str, str], float]
+    loops: Sequence[VectorLoop], motion: PositionMotion, unknowns: dict[tuple[str, str], float]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the components of the closures of loops (m), and their derivatives with respect to the unknowns."""
 
     def vector(x: LoopVector) -> tuple[float, float]:
-        angle = 0.0 if x.body == GROUND else unknowns.get(("angle", x.body), rates.angles[x.body][0])
+        angle = 0.0 if x.body == GROUND else unknowns.get(("angle", x.body), motion.angles[x.body][0])
         return angle + x.turn, unknowns.get(("slide", x.slide), x.size)
 
     f, J = np.zeros(2 * len(loops)), np.zeros((2 * len(loops), len(unknowns)))

@@ -61,5 +61,5 @@ def solution_of(symbols: PositionSymbols, loops: list[VectorLoop]) -> LoopSoluti
     found = [symbols.angle(body) for loop in loops for body in loop.angles]
     found += [symbols.length(lines_of[slide]) for loop in loops for slide in loop.slides]
     systems = velocity_system(symbols, loops), acceleration_system(symbols, loops)
-    steps = [] if branches else newton_steps(loops, symbols.rates)
+    steps = [] if branches else newton_steps(loops, symbols.motion)
     return LoopSolution(loops, closures, shared, branches, steps, found, *systems)

@@ -23,7 +23,7 @@ from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.tables.checks import SceneError
 from udkjax.statics.resting_forces import has_gravity, resting_forces
 from udkjax.study.worked.figures import PolygonSide
-from udkjax.study.worked.iterations import PositionRates
+from udkjax.study.worked.iterations import PositionMotion
 from udkjax.study.worked.loop_solutions import LoopSolution, solution_of
 from udkjax.study.worked.loops import Geometry, drawing_of, loops_of
 from udkjax.study.worked.page import page_of
@@ -126,7 +126,7 @@ def worked_solution(mechanism: Mechanism, at: NumberLike | str, digits: int = 6,
     angles = {name: (geometry.angles[name], float(rates[0][k]), float(rates[1][k])) for k, name in enumerate(names)}
     slides = {joint.name: _slide(geometry, joint.name, v, a) for joint in geometry.connections if joint.slides}
     pins = {joint.name: joint.pin for joint in geometry.connections}
-    symbols = PositionSymbols(PositionRates(angles, slides), pins)
+    symbols = PositionSymbols(PositionMotion(angles, slides), pins)
     motion = pin_motion(mechanism, found).counted(count)
     solved = [solution_of(symbols, loops) for loops in loops_of(geometry)]
     polygons = _polygon(geometry, motion, 1), _polygon(geometry, motion, 2)

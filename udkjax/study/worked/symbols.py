@@ -1,7 +1,7 @@
 """Symbols of a position, and components of vectors that are written in these symbols."""
 
 from udkjax.scene.elements.bodies import GROUND
-from udkjax.study.worked.iterations import PositionRates
+from udkjax.study.worked.iterations import PositionMotion
 from udkjax.study.worked.loops import LoopVector
 from udkjax.study.worked.terms import (
     EquationLine,
@@ -19,20 +19,20 @@ COMPONENT_FUNCTIONS = ("cos", "sin")
 class PositionSymbols:
     """The symbols of a position: lengths, angles and their derivatives, with their values."""
 
-    def __init__(self, rates: PositionRates, pins_of_slides: dict[str, str]):
-        self.rates, self.pins = rates, pins_of_slides
+    def __init__(self, motion: PositionMotion, pins_of_slides: dict[str, str]):
+        self.motion, self.pins = motion, pins_of_slides
 
     def angle(self, body: str, order: int = 0) -> NamedQuantity:
         """Return the angle of a body (`order` 0), its angular velocity (1) or its angular acceleration (2)."""
         letter, unit = (("θ", "rad"), ("ω", "rad/s"), ("α", "rad/s2"))[order]
-        return NamedQuantity(letter, body, self.rates.angles[body][order], unit)
+        return NamedQuantity(letter, body, self.motion.angles[body][order], unit)
 
     def length(self, vector: LoopVector, order: int = 0) -> NamedQuantity:
         """Return the length of a vector, or its derivative of an `order`, which may be 1 or 2 for a vector along a line."""
         if not vector.slide:
             return NamedQuantity("r", vector.start + vector.end, vector.size, "m")
         return NamedQuantity(
-            "s", self.pins[vector.slide], self.rates.slides[vector.slide][order], ("m", "m/s", "m/s2")[order], order
+            "s", self.pins[vector.slide], self.motion.slides[vector.slide][order], ("m", "m/s", "m/s2")[order], order
         )
 
     def direction(self, vector: LoopVector) -> EquationTerm:

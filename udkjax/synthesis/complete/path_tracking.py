@@ -92,12 +92,12 @@ class PathTracker:
 
     Args:
         program: maps real and imaginary parts of z (N) and s, and of p0 and p1 - p0, to those of the Newton step and of dz/ds.
-        unknowns: the number N of unknowns.
+        unknown_count: the number N of unknowns.
     """
 
-    def __init__(self, program: ScalarProgram, unknowns: int):
-        self.unknowns = unknowns
-        self._program = BatchProgram(program, len(program.inputs) - 2 * unknowns - 2)
+    def __init__(self, program: ScalarProgram, unknown_count: int):
+        self.unknown_count = unknown_count
+        self._program = BatchProgram(program, len(program.inputs) - 2 * unknown_count - 2)
 
     def __call__(
         self,
@@ -159,7 +159,7 @@ class PathTracker:
 
     def _evaluate(self, z: np.ndarray, t: np.ndarray, bend: float, shared: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the Newton step and dz/dt (N, M) at points z and t; `shared` has the parameters of all paths."""
-        n = self.unknowns
+        n = self.unknown_count
         outputs = self._program(np.concatenate([np.real(z), np.imag(z), t[None], (bend * t * (1.0 - t))[None]]), shared)
         step, rate = (outputs[k : k + n] + 1j * outputs[k + n : k + 2 * n] for k in (0, 2 * n))
         return step, rate * (1.0 + 1j * bend * (1.0 - 2.0 * t))

@@ -68,7 +68,7 @@ def _changing_scene(phases: Phases, *events: Event) -> _ChangingScene:
     locks = {switches.contacts[x.event] for x in phases.sticking}
     own = tuple(k for k in range(len(switches.names)) if k not in locks)
     names = [switches.names[k] for k in own if switches.first[k]]
-    public, of_scene, adding, joints = list(names), len(names), [], []
+    public, scene_constraint_count, adding, joints = list(names), len(names), [], []
     for (event, name), joint in zip(phases.added_by, phases.added, strict=True):
         if switches.names.index(name) not in locks:
             addition = events[event].action.addition(scene, events[event].name)
@@ -82,7 +82,13 @@ def _changing_scene(phases: Phases, *events: Event) -> _ChangingScene:
     rubbing = {contacts[x.contact][0]: x for x in phases.sticking if x.contact >= 0}
     friction = {name: _friction(events[x.contact], name) for name, x in rubbing.items()}
     numbers, form = numbers_and_form([*joints, *(joint for _, joint in contacts.values())], friction)
-    fields = {"numbers": numbers, "form": form, "names": tuple(names), "public": tuple(public), "of_scene": of_scene}
+    fields = {
+        "numbers": numbers,
+        "form": form,
+        "names": tuple(names),
+        "public": tuple(public),
+        "scene_constraint_count": scene_constraint_count,
+    }
     fields["sticking"] = tuple(x.name for x in rubbing.values())
     return _ChangingScene(own, tuple(adding), scene.q0.reshape(1, -1), fields)
 

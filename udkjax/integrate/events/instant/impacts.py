@@ -70,7 +70,8 @@ COUPLING_TOL = 1e-12
 # they violate the other constraints.
 ATTACH_TOL = 1e-6
 
-OPEN, TOUCHES, SLOW = 0, 1, 2  # the states of a contact at an event: not closed, closed, closed and without restitution
+# The states of a contact at an event: not in contact, in contact and with restitution, in contact and without.
+OPEN, REBOUNDS, SLOW = 0, 1, 2
 
 
 class Contacts(NamedTuple):
@@ -104,7 +105,7 @@ class Impulses(NamedTuple):
 class KnownContacts(NamedTuple):
     """States of the contacts at an event, as the run found them; its derivatives reuse them."""
 
-    closed: Int[Any, "*m E"]  # OPEN, TOUCHES or SLOW
+    contact_state: Int[Any, "*m E"]  # OPEN, REBOUNDS or SLOW
     held: Bool[Any, "*m E"]  # whether each contact is held after the event
 
 
@@ -112,7 +113,7 @@ class ContactChanges(NamedTuple):
     """The contacts at an event, and their states after it."""
 
     v: Float[Any, "*m n"]  # velocities after the event
-    closed: Int[Any, "*m E"]  # OPEN, TOUCHES or SLOW, with those whose rebound was left out
+    contact_state: Int[Any, "*m E"]  # OPEN, REBOUNDS or SLOW, with those whose rebound was left out
     hits: Bool[Any, "*m E"]  # contacts that hit at the event
     held: Bool[Any, "*m E"]  # contacts that are held after the event
     rests: Bool[Any, "*m E"]  # contacts that do not separate after the event, held or not
@@ -220,10 +221,12 @@ def contact_states(
     W: Float[Any, "*m E E"],
     xp: ModuleType,
 ) -> Int[Any, "*m E"]:
-    """Return the state of each contact in event k: OPEN if it takes no part, SLOW if it is too slow to rebound, else TOUCHES.
+    """Return the state of each contact in event k: OPEN if it takes no part, SLOW if it does without rebound, else REBOUNDS.
 
-    A contact takes part if it is closed, does not separate and, if the event is of a contact, acts on that contact, directly or
-    through others. A contact is slow if its g_dot is small while it is pressed.
+    If the event is of a contact (contact k hits, or contact k - E opens), this contact takes part, and so do the closed contacts that do
+    not separate and that are joined to it: impulses on one change the speed of the other, directly or through others. In an event
+    of another kind all closed contacts that do not separate take part. A contact is SLOW if its g_dot is small while it is
+    pressed, and if it was not held.
     """
     h, rate, rate_2, _, scale = before
     E, system = h.shape[-1], contacts.rate[..., None]
@@ -241,7 +244,7 @@ def contact_states(
     closed = closed & joined
     slow = xp.abs(rate) < REST_SPEED * unit
     pressed = rate_2 < -ZERO_RATE_2_TOL * unit * system
-    return xp.where(closed, xp.where(slow & pressed & ~held, SLOW, TOUCHES), OPEN)
+    return xp.where(closed, xp.where(slow & pressed & ~held, SLOW, REBOUNDS), OPEN)
 
 
 def hit_contacts(
@@ -273,9 +276,9 @@ def hit_contacts(
     stop: Callable[[Any], Any] = (lambda x: x) if xp is np else stop_gradients
     scale, system = stop(before.scale), contacts.rate[..., None]
     floor = ZERO_RATE_TOL * scale * system
-    closed = contact_states(contacts, k, held, before, rows.W, xp) if known is None else known.closed
-    restitution = xp.where(closed == SLOW, 0.0, contacts.restitution)
-    touches = closed > OPEN
+    contact_state = contact_states(contacts, k, held, before, rows.W, xp) if known is None else known.contact_state
+    restitution = xp.where(contact_state == SLOW, 0.0, contacts.restitution)
+    touches = contact_state > OPEN
     rubs = touches & (contacts.tangents >= 0)
 
     def impulses(restitution: Any) -> Impulses:
@@ -291,16 +294,16 @@ def hit_contacts(
     if known is not None:
         impact, no = impulses(restitution), xp.zeros_like(touches)
         is_held = xp.where(contacts.impacts, known.held, held)  # locks of joints begin later, at the places of the joints then
-        return ContactChanges(velocities(impact), closed, no, is_held, is_held, no, no, impact.remaining)
+        return ContactChanges(velocities(impact), contact_state, no, is_held, is_held, no, no, impact.remaining)
     # The set of held contacts is discrete, and has no derivatives.
-    W, fixed_rate, pressed = stop(rows.W), stop(rate), ZERO_RATE_2_TOL * scale * system**2
+    W, undifferentiated_rate, pressed = stop(rows.W), stop(rate), ZERO_RATE_2_TOL * scale * system**2
     may_stay = (touches) & rows.free & (np.arange(rate.shape[-1]) + rate.shape[-1] != k[..., None])
-    still = xp.maximum(floor, STILL_TOL * _largest(fixed_rate, touches, xp))
+    still = xp.maximum(floor, STILL_TOL * _largest(undifferentiated_rate, touches, xp))
     slow = xp.maximum(still, REST_SPEED * scale * system)
     impact = impulses(restitution)
     stays, is_held = may_stay & (stop(impact.rate) <= slow), xp.where(touches, False, held)
     ends, carried = xp.zeros_like(stays), xp.zeros_like(stays)
-    hits = (closed == TOUCHES) & ~held & (fixed_rate < -floor)
+    hits = (contact_state == REBOUNDS) & ~held & (undifferentiated_rate < -floor)
     if xp is not np or stays.any():
         pull = second_rates(stop(velocities(impact)))
         weak = xp.maximum(pressed, STILL_TOL * _largest(pull, stays, xp))
@@ -316,7 +319,7 @@ def hit_contacts(
         rises = xp.any(presses & (stop(impact.rate) > still), axis=-1, keepdims=True)
         if xp is not np or rises.any():
             rests = presses | (stays & idle & _depends(W, presses, contacts.impacts, xp))
-            closed = xp.where(rests & rises, SLOW, closed)  # recorded: derivatives follow the impact that was chosen
+            contact_state = xp.where(rests & rises, SLOW, contact_state)  # recorded: derivatives follow this impact
             again = impulses(xp.where(rests & rises, 0.0, restitution))
             impact = Impulses(*(_where_any(rises, x, y, xp) for x, y in zip(again, impact, strict=True)))
         stays = may_stay & (stop(impact.rate) <= still)
@@ -326,7 +329,7 @@ def hit_contacts(
         carried = is_slow & ~is_held & idle & _depends(W, is_held, contacts.impacts, xp)
         ends, stays = presses & contacts.stop, stays | carried
     v = velocities(impact)
-    return ContactChanges(v, closed, hits, is_held, stays, ends, carried, impact.remaining)
+    return ContactChanges(v, contact_state, hits, is_held, stays, ends, carried, impact.remaining)
 
 
 def _where_any(mask: Bool[Any, "*m E"], x: Any, y: Any, xp: ModuleType) -> Any:

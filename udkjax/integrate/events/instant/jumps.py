@@ -134,7 +134,7 @@ def _apply_event(
 
     hit = hit_contacts(_contacts(system, members), k, v, held, values, rows, rate, second_rates, known, xp)
     contacts = hit._replace(
-        closed=xp.where(acts, hit.closed, OPEN),
+        contact_state=xp.where(acts, hit.contact_state, OPEN),
         hits=hit.hits & acts,
         held=xp.where(acts, hit.held, held),
         rests=xp.where(acts, hit.rests, held & plan.impacts),

@@ -29,7 +29,7 @@ from udkjax.integrate.events.law.kinks import FREE_SIDE, MOST_KINKS
 from udkjax.integrate.solution import Result
 from udkjax.native.watching.conditions import RESOLUTION
 
-CLOSED_FIELD, INDEX_FIELD = RECORD_FIELDS.index("closed"), RECORD_FIELDS.index("event_index")
+CONTACT_STATE_FIELD, INDEX_FIELD = RECORD_FIELDS.index("contact_state"), RECORD_FIELDS.index("event_index")
 
 
 def run_loop(system: System, runs: MemberRuns) -> MemberRuns:
@@ -126,8 +126,8 @@ def _settled(system: System, runs: MemberRuns, members: MemberIndices) -> Bool[A
     xp, plan = system.xp, system.plan
     last = xp.maximum(take(runs.count, members) - 1, 0)
     indices = np.arange(len(runs.t)) if members is None else members
-    closed, index = (runs.record[k][indices, last] for k in (CLOSED_FIELD, INDEX_FIELD))
-    return (closed > OPEN) | ((np.arange(plan.count) == index[:, None]) & ~plan.changes)
+    contact_state, index = (runs.record[k][indices, last] for k in (CONTACT_STATE_FIELD, INDEX_FIELD))
+    return (contact_state > OPEN) | ((np.arange(plan.count) == index[:, None]) & ~plan.changes)
 
 
 def _jump(
@@ -147,9 +147,9 @@ def _jump(
     sides = xp.where(is_current, xp.where(falls[:, None], 1, -sides), sides)
     if plan.adds.any():
         sides = xp.where(is_current & _stands(system, members, e, after, values, state_values)[:, None], 0, sides)
-    noted, others, closed = k[:, None], xp.zeros((len(k), 0), bool), xp.full(held.shape, OPEN)
+    noted, others, contact_state = k[:, None], xp.zeros((len(k), 0), bool), xp.full(held.shape, OPEN)
     if contacts is not None:
-        closed = contacts.closed
+        contact_state = contacts.contact_state
         rests = (contacts.held & ~held) | contacts.ends
         happens = xp.concatenate([contacts.hits, held & ~contacts.held, rests], axis=1)
         # The event itself is recorded first, even if its contact only comes to rest.
@@ -157,10 +157,10 @@ def _jump(
         first = xp.where(only_rests, 2 * E + k, k)[:, None]
         others = happens & (np.arange(3 * E) != first)
         noted = xp.concatenate([first, xp.zeros_like(first) + np.arange(3 * E)], axis=1)
-        carried = xp.where(closed > OPEN, contacts.carried, carried)
+        carried = xp.where(contact_state > OPEN, contacts.carried, carried)
         code = xp.where(xp.any(contacts.ends, -1), Result.at_rest, code)
-        turned_back = ~plan.impacts & (xp.abs(values.h) <= ZERO_TOL * values.scale) & xp.any(closed > OPEN, -1)[:, None]
-        is_closed = xp.concatenate([closed, closed], axis=1) > OPEN
+        turned_back = ~plan.impacts & (xp.abs(values.h) <= ZERO_TOL * values.scale) & xp.any(contact_state > OPEN, -1)[:, None]
+        is_closed = xp.concatenate([contact_state, contact_state], axis=1) > OPEN
         sides = xp.where(is_closed, 1, xp.where(xp.concatenate([turned_back, xp.zeros_like(turned_back)], axis=1), 0, sides))
     blocked = result != Result.successful
     code = xp.where(blocked, result, code)
@@ -191,11 +191,11 @@ def _jump(
         noted,
         after.phase[:, None],
         np.arange(noted.shape[1])[None] > 0,
-        closed[:, None],
+        contact_state[:, None],
         turned[:, None],
     )
     follows = _may_follow(
-        system, values, plan.watched(after.phase, carried, xp)[:, :E], closed, is_current[:, :E] & ~acts[:, None]
+        system, values, plan.watched(after.phase, carried, xp)[:, :E], contact_state, is_current[:, :E] & ~acts[:, None]
     )
     return runs.put(
         members,
@@ -234,13 +234,13 @@ def _carried(system: System, members: MemberIndices, carried: Bool[Any, "b E"], 
 
 
 def _may_follow(
-    system: System, values: ConditionValues, watched: Bool[Any, "b E"], closed: Int[Any, "b E"], settled: Bool[Any, "b E"]
+    system: System, values: ConditionValues, watched: Bool[Any, "b E"], contact_state: Int[Any, "b E"], settled: Bool[Any, "b E"]
 ) -> Bool[Any, "b"]:
     """Return a mask of the members whose event may cause another one at the same instant.
 
-    A condition depends on velocities, or a watched one is zero, not `settled`, and of no closed contact. `closed` are the states
-    of contacts at the event (OPEN, TOUCHES, SLOW); `settled` marks an event that changes nothing. Joints with set-valued friction
-    are left out: a single decision covers every joint at rest.
+    A condition depends on velocities, or a watched one is zero, not `settled`, and of no closed contact. `contact_state` has the
+    states of contacts at the event (OPEN, REBOUNDS, SLOW); `settled` marks an event that changes nothing. Joints with set-valued
+    friction are left out: a single decision covers every joint at rest.
     """
-    unclear = watched & ~settled & (closed == OPEN) & (system.xp.abs(values.h) <= ZERO_TOL * values.scale)
+    unclear = watched & ~settled & (contact_state == OPEN) & (system.xp.abs(values.h) <= ZERO_TOL * values.scale)
     return system.xp.any((unclear | system.plan.follows_velocity) & ~system.plan.slides, axis=-1)

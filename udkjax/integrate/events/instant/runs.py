@@ -51,7 +51,7 @@ class EventRun(NamedTuple):
     event_index: Int[Any, "*m K"]  # index of the event; plus E if a contact opens, plus 2 E if it comes to rest
     event_phase: Bool[Any, "*m K C"]  # phase after the event
     together: Bool[Any, "*m K"]  # whether it happens together with the previous event, as one
-    closed: Int[Any, "*m K E"]  # the states of all contacts, as in `ContactChanges`
+    contact_state: Int[Any, "*m K E"]  # the states of all contacts, as in `ContactChanges`
     sides: Float[Any, "*m K S"]  # the sides of comparisons after the event
     count: Int[Any, "*m"]  # number of events
     unresolved: Float[Any, "*m E"]  # as in `Events`
@@ -69,7 +69,7 @@ RECORD_FIELDS = (
     "event_index",
     "event_phase",
     "together",
-    "closed",
+    "contact_state",
     "sides",
 )  # fields of `EventRun` with an entry for each event
 
@@ -153,7 +153,7 @@ def runs_before(plan: EventPlan, state: RunState, T: int, code: Int[Any, "B"], x
         "event_index": -1,
         "event_phase": False,
         "together": False,
-        "closed": 0,
+        "contact_state": 0,
         "sides": 0.0,
     }
     no = xp.zeros((B, E), bool)

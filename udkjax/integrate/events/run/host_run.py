@@ -78,7 +78,7 @@ def run_by_machine_code(hybrid: Hybrid, conditions: Conditions) -> EventRun:
     ]
     run = EventRun(*(x[0] for x in call_host(HostRun(plan, len(hybrid.ts), len(hybrid.q), plain), stop_gradients(inputs))))
     integers, masks = (
-        ("event_index", "closed", "count", "code", "totals"),
+        ("event_index", "contact_state", "count", "code", "totals"),
         ("event_phase", "together", "undefined", "first_phase"),
     )
     run = run._replace(**{name: getattr(run, name).astype(int) for name in integers})

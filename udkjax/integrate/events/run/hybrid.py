@@ -190,7 +190,7 @@ class Hybrid(eqx.Module):
             (t, q, v, *_), equations = at, self.textbook(which, at)
             mobilities = directions = jnp.zeros_like(normals)
             if is_free and not self.plan.has_bodies:
-                mobilities, directions = jax.vmap(lambda normal: equations.impulse(t, q, v, normal))(normals)
+                mobilities, directions = jax.vmap(lambda normal: equations.unit_impulse_response(t, q, v, normal))(normals)
             elif is_free or is_directed:
                 directions = contact_rows(equations, t, q, normals).directions
             return equations.accelerations(t, q, v), mobilities, directions

@@ -318,7 +318,7 @@ def _apply_at_fixed_time(
     before = with_member(_moved(hybrid, state, d, a))
     at_end = with_member(state._replace(phase=found.event_phase[j], joints=(*state.joints[:-1], found.sides[j])))
     modes = modes_of(system, None, at_end) if system.plan.sticking else None
-    known = KnownContacts(found.closed[j][None], system.plan.held(at_end.phase, jnp))
+    known = KnownContacts(found.contact_state[j][None], system.plan.held(at_end.phase, jnp))
     after = apply_event(system, None, k[None], before, *evaluated, known, modes).state
     after = without_member(after)._replace(phase=found.event_phase[j])
     after = after._replace(joints=(*after.joints[:-1], found.sides[j]))

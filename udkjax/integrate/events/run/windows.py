@@ -145,7 +145,7 @@ def advance_window(motion: WindowMotion, window: Window, state: RunState, given:
     q = xp.where(is_extrapolated, state.q + (times - t)[:, None] * state.v, raw.q)
     v = xp.where(is_extrapolated, state.v, raw.v)
     lands = window.lands & (np.arange(2 * E) == window.event)
-    good = xp.cumsum(~(is_extrapolated[:, 0] | (raw.reached & (np.arange(len(times)) < raw.lost)))) == 0
+    good = xp.cumsum(~(is_extrapolated[:, 0] | (raw.reached & (np.arange(len(times)) < raw.first_drifted)))) == 0
 
     at = xp.searchsorted(times, nodes)
     g, g_dot, forces = motion.watch(state, nodes, q[at], v[at])

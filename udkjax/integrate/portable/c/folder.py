@@ -1,4 +1,4 @@
-"""A folder of C99 that runs a scene: `export_c`."""
+"""Export of a scene as a folder of C99 source that runs it: `export_c`."""
 
 import re
 from collections.abc import Callable, Collection, Sequence

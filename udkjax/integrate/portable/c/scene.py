@@ -327,12 +327,12 @@ static int integrate(const double *numbers, const double *ts, int times, const d
         """
         values = scalar_parameters(self.mechanism, names)
         program = NumberProgram(self.mechanism, values, lambda given: given.without_origin)
-        if any(k >= program.count for k in program.changing):
+        if any(k >= program.count for k in program.changing_numbers):
             why = "parameters move times at which the motion is not smooth"
             raise ArgumentError(f"{why}: leave out those of motion laws over time")
         name, to = ("numbers_along", "dnumbers") if along else ("numbers", "values")
         text, call = "#include <string.h>\n", f"(void)parameters, (void){to};"
-        if program.changing:
+        if program.changing_numbers:
             text = c_function(program.function_along() if along else program.function())
             call = f"{name}((double *)(uintptr_t)parameters, {to});"
         clear = f"    memset(dnumbers, 0, {len(self.numbers)} * sizeof *dnumbers);\n" if along else ""

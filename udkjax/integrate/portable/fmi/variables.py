@@ -171,4 +171,4 @@ def _parameters(mechanism: Mechanism) -> dict[str, float]:
 
 def _moves_times(mechanism: Mechanism, values: dict[str, float]) -> bool:
     program = NumberProgram(mechanism, values, lambda given: given.without_origin)
-    return any(k >= program.count for k in program.changing)
+    return any(k >= program.count for k in program.changing_numbers)

@@ -5,8 +5,8 @@
 A frame is [body, x, y, angle, turns]: its origin is a place (m) of a body, and its x axis is at an angle (rad) to the body's, or
 to the ground's if `turns` is 0. Or it is two anchors [[body, x, y], [body, x, y]], with its x axis from the first to the second.
 A point is [x, y, px, py]: x and y in m, or relative to the distance of the anchors; px and py, which may be left out, in the unit
-of symbols, which does not depend on the size of the scene. A radius is
-[m, units, smallest units]. Colours are names of a theme, or "edge:3", "tint:3", "spoke:3" of a body.
+of symbols, which does not depend on the size of the scene. A radius [m, units, smallest] is the sum of a length in m and a number
+of these units, at least `smallest` units. Colours are names of a theme, or "edge:3", "tint:3", "spoke:3" of a body.
 """
 
 from collections.abc import Iterator, Sequence

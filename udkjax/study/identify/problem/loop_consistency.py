@@ -170,8 +170,8 @@ class RedundantLoops:
         magnitude = np.abs(self.x)
         self._size = np.where(magnitude < SMALL_VALUE * by_effect, by_effect, np.minimum(magnitude, by_effect))
         effect = slope / np.array([length for _, length, _ in evaluated])[:, :, None]
-        total = np.sqrt((effect**2).sum((0, 1)) / len(effect))
-        self._unit = 1.0 / np.where(total > 0, total, 1.0)  # change of each parameter whose effect is one
+        norm = np.sqrt((effect**2).sum((0, 1)) / len(effect))  # over rows; the root mean square over positions
+        self._unit = 1.0 / np.where(norm > 0, norm, 1.0)  # change of each parameter whose effect is one
         self._effect = effect * self._unit
         null_spaces = [rows.dense(p.null_space) for p in self._positions]
         self._unclosed = np.concatenate([N.T @ e for N, e in zip(null_spaces, self._effect, strict=True)])

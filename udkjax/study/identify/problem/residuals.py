@@ -65,9 +65,9 @@ def residual_vector(blocks: Iterable[Residuals]) -> tuple[Float[np.ndarray, "R"]
 class Reduction:
     """Rows of [J r], reduced to few as they are added: see `reduce_rows`. `count` is the number of rows that were added."""
 
-    def __init__(self, unknowns: int):
+    def __init__(self, unknown_count: int):
         self.count = 0
-        self._table = np.zeros((0, unknowns + 1))
+        self._table = np.zeros((0, unknown_count + 1))
 
     def add(self, r: Float[np.ndarray, "R"], J: Float[np.ndarray, "R K"]) -> None:
         """Add R residuals and their Jacobian."""
@@ -139,7 +139,7 @@ class ReducedGroups(NamedTuple):
 
 def reduce_groups(
     blocks: Iterable[Residuals],
-    unknowns: int,
+    unknown_count: int,
     group: Int[np.ndarray, "R"],
     priors: int = 0,
     used: Bool[np.ndarray, "R"] | None = None,
@@ -148,12 +148,12 @@ def reduce_groups(
 
     Args:
         blocks: the residuals of the fit; the first set of unknowns is used.
-        unknowns: number K of unknowns.
+        unknown_count: number K of unknowns.
         group: the group (0, 1, ...) of residuals with a common unknown noise; -1 if the noise is known.
         priors: number of residuals of priors, which are the last rows.
         used: mask of the rows that are used; by default all are.
     """
-    groups, prior_rows = [Reduction(unknowns) for _ in range(group.max(initial=-1) + 2)], np.zeros((priors, unknowns))
+    groups, prior_rows = [Reduction(unknown_count) for _ in range(group.max(initial=-1) + 2)], np.zeros((priors, unknown_count))
     for block in blocks:
         rows, r, J = block.row_numbers, block.r[0], block.J[0]
         of_block = group[rows] if used is None else np.where(used[rows], group[rows], len(groups))
