@@ -245,7 +245,7 @@ class StageEquations:
             for x in "qv":
                 old = module.vector(f, f"{start} {x}", r)
                 module.put(f, f"state {x}", r, old)
-                module.put(f, f"weight {x}", r, 1.0 / f.fma(rtol, f.abs(old), module.vector(f, f"scale {x}", r)))
+                module.put(f, f"weight {x}", r, 1.0 / f.fma(rtol, f.abs(old), module.vector(f, f"atol {x}", r)))
         s.renew, s.eager = s.stepping, f.max(s.eager - 1.0, 0.0)
         f.call("factor_stage", f.given["work"])
         if start == "point3":
