@@ -223,10 +223,10 @@ def contact_states(
 ) -> Int[Any, "*m E"]:
     """Return the state of each contact in event k: OPEN if it takes no part, SLOW if it does without rebound, else REBOUNDS.
 
-    If the event is of a contact (contact k hits, or contact k - E opens), this contact takes part, and so do the closed contacts that do
-    not separate and that are joined to it: impulses on one change the speed of the other, directly or through others. In an event
-    of another kind all closed contacts that do not separate take part. A contact is SLOW if its g_dot is small while it is
-    pressed, and if it was not held.
+    If the event is of a contact (contact k hits, or contact k - E opens), this contact takes part, and so do the closed contacts
+    that do not separate and that are joined to it: impulses on one change the speed of the other, directly or through others. In
+    an event of another kind all closed contacts that do not separate take part. A contact is SLOW if its g_dot is small while it
+    is pressed, and if it was not held.
     """
     h, rate, rate_2, _, scale = before
     E, system = h.shape[-1], contacts.rate[..., None]
