@@ -516,7 +516,7 @@ def test_the_violation_along_values_is_that_of_the_driven_mechanism():
             lambda m: m.q, motion, motion.q.at[1:].add(1e-3 * np.arange(motion.q[1:].size).reshape(motion.q[1:].shape))
         )
         assert np.abs(udk.violation(mech, off)).max() > 1e-4
-    traced = jax.jit(lambda a: udk.violation(crank, udk.kinematics(crank, "motor", a + values)))(0.1)
+    traced = deferred(lambda a: udk.violation(crank, udk.kinematics(crank, "motor", a + values)))(jnp.asarray(0.1))
     assert np.abs(traced).max() < 1e-12
 
 
