@@ -42,8 +42,8 @@ class RunPlan:
     operation: RunStates | None  # the machine code that integrates the mechanism
     evaluation: Accelerate | None  # the machine code that evaluates its equations for diffrax; None: `TextbookEquations` in JAX
     why_not_native: str  # the reason why machine code does not integrate; "" if it does
-    independent_rows: int = 0  # the number of rows that the method uses
-    most_rank: int = 0  # the number of rows not known to be redundant: a larger rank is due to rounding or violated rows
+    used_row_count: int = 0  # the number of rows that the method uses
+    max_rank: int = 0  # the number of rows not known to be redundant: a larger rank is due to rounding or violated rows
     orders_by_diffrax: float = (
         np.inf
     )  # the highest order of derivatives that are right with diffrax, which does not locate pieces
@@ -130,7 +130,7 @@ def compile_mechanism(
     projects = isinstance(stabilization, Projection) or equations.solves_constraints
     projected, breakpoints = equations.constrained and projects, system.breakpoints
     own = stabilization if isinstance(stabilization, Stabilization) else None
-    operation, evaluation, rows, most_rank = None, None, 0, 0
+    operation, evaluation, rows, max_rank = None, None, 0, 0
     if engine in ("diffrax", "jax"):
         why = "it was asked for"
     else:
@@ -140,8 +140,8 @@ def compile_mechanism(
     if not why:
         operation = _run_operation(equations, solver, projected, breakpoints)
         textbook = equations.textbook
-        most_rank = len(textbook.scales.rows) - len(textbook.redundant or ())
-        rows = most_rank if eliminates(textbook.method) else len(textbook.scales.rows)
+        max_rank = len(textbook.scales.rows) - len(textbook.redundant or ())
+        rows = max_rank if eliminates(textbook.method) else len(textbook.scales.rows)
         why = _reason_for_programs(operation)
         if own is not None and not why:
             operation, why = _stabilized(operation, own)
@@ -150,7 +150,7 @@ def compile_mechanism(
     if engine == "native" and why:
         raise ValueError(f'engine="native" cannot: {why}. engine="auto" uses diffrax instead')
     orders = _orders_by_diffrax(system, projected)
-    plan = RunPlan(solver, projected, None if why else operation, evaluation, why, rows, most_rank, orders)
+    plan = RunPlan(solver, projected, None if why else operation, evaluation, why, rows, max_rank, orders)
     return CompiledMechanism(equations, breakpoints, plan)
 
 

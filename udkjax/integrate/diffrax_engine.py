@@ -14,7 +14,7 @@ from udkjax.equations.laws.abstract_system import AbstractSystem
 from udkjax.equations.states.textbook import TextbookEquations
 from udkjax.integrate.compiled_mechanism import eliminates
 from udkjax.integrate.constrained import Constrained
-from udkjax.integrate.drift import DriftController, most_rank
+from udkjax.integrate.drift import DriftController, max_rank
 from udkjax.integrate.native_equations import equations_for_diffrax
 from udkjax.integrate.outcome import status_at_end
 from udkjax.integrate.problem import IntegratorOutput, Problem
@@ -66,7 +66,7 @@ def integrate_by_diffrax(
     equations = problem.equations
     if isinstance(equations, TextbookEquations) and equations.redundant != () and not eliminates(equations.method):
         # machine code looks after every step
-        is_held = equations.rank(t_end[0], jnp.split(end[0], 2)[0]) > stop_gradients(most_rank(problem, equations))
+        is_held = equations.rank(t_end[0], jnp.split(end[0], 2)[0]) > stop_gradients(max_rank(problem, equations))
         status = jnp.where(is_held & jnp.isfinite(problem.drift_tol), Status.SPURIOUS_RANK, status)
     if isinstance(equations, TextbookEquations) and problem.compiled.plan.projected:
         mean_step = (t_end[0] - ts[0]) / jnp.maximum(run.stats["num_accepted_steps"], 1)

@@ -39,7 +39,7 @@ def distance(equations: AbstractSystem, t: Float[ArrayLike, ""], y: Float[Array,
     return jnp.sqrt(jnp.min(jnp.where(squares > DEPENDENT_DISTANCE**2 * len(A), squares, 1.0), initial=1.0))
 
 
-def most_rank(problem: Problem, equations: TextbookEquations) -> Float[Array, ""]:
+def max_rank(problem: Problem, equations: TextbookEquations) -> Float[Array, ""]:
     """Return the largest number of independent rows along a motion; a larger rank of D is due to rounding or violated rows."""
     if equations.redundant is not None:
         return jnp.asarray(float(len(equations.scales.rows) - len(equations.redundant)))

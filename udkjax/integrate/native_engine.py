@@ -176,7 +176,7 @@ def run_inputs(problem: Problem, operation: RunStates, xp: ModuleType = jnp) -> 
         "omega": problem.rate,
         "max_steps": problem.max_steps,
         "drift_tol": problem.drift_tol,
-        "most_rank": xp.where(xp.isinf(problem.drift_tol), np.inf, float(compiled.plan.most_rank)),
+        "max_rank": xp.where(xp.isinf(problem.drift_tol), np.inf, float(compiled.plan.max_rank)),
         "open_tol": xp.maximum(problem.drift_tol, scene.thresholds[1]),
     }
     if operation.stabilization is not None:

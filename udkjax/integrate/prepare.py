@@ -279,7 +279,7 @@ def _start(
     if closure is not None:
         state, closed = closure.state, xp.asarray(closure.is_closed)
         if compiled.plan.is_native:
-            missed = closed & (xp.asarray(closure.rank) > compiled.plan.independent_rows)
+            missed = closed & (xp.asarray(closure.rank) > compiled.plan.used_row_count)
     assert state is not None  # a state or a closure is given
     q, v = xp.ravel(xp.asarray(state.q)), xp.ravel(xp.asarray(state.v))
     if analysis is not None:

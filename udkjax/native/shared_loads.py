@@ -85,7 +85,7 @@ def _with_weights(inputs: Sequence[np.ndarray], operation: Operation, shared: in
     weights = settings[:, names.index("length"), None] / inputs[ROWS]
     numbers = np.broadcast_to(inputs[NUMBERS], (max(len(inputs[NUMBERS]), len(weights)), inputs[NUMBERS].shape[1])).copy()
     numbers[:, marks] = np.where(numbers[:, marks] == 0, 0.0, weights)
-    if "most_rank" in names:
-        settings[:, names.index("most_rank")] -= shared
+    if "max_rank" in names:
+        settings[:, names.index("max_rank")] -= shared
     changed = {NUMBERS: numbers, SETTINGS: settings}
     return [changed.get(k, x) for k, x in enumerate(inputs)]

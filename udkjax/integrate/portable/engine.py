@@ -213,8 +213,8 @@ def _run_modules(
         "sampled": list(operation.sampled),
         "samples": floats(inputs[len(Operation.input_names)][0]) if operation.sampled else "",
     }
-    if data["shared"] is not None and "most_rank" in data["settings"]:
-        data["settings"]["most_rank"] -= len(data["shared"])
+    if data["shared"] is not None and "max_rank" in data["settings"]:
+        data["settings"]["max_rank"] -= len(data["shared"])
     modules = {"run": _operation(events.watched_by(operation))}
     if events.events:
         instants = events.instants(operation)

@@ -37,7 +37,7 @@ class Closing(Module):
         self.active, self.count = active, len(self.moving)
         self._rows = WeightedRows(self, SVDCode(relative=True)) if code.is_small else None
         self.corrections = {x: self._correction(f"newton_{x}") for x in CORRECTED_QUANTITIES}
-        self.places.add("correction", max(x.stored for x in self.corrections.values()))
+        self.places.add("correction", max(x.stored_size for x in self.corrections.values()))
 
     def _correction(self, name: str) -> LeastNormCorrection | EliminationCorrection:
         return LeastNormCorrection(self, name, self._rows) if self._rows else EliminationCorrection(self, name)

@@ -149,7 +149,7 @@ class ClosingTwice(ClosingForward):
     def __init__(self, code: RunPrograms, vector: int, active: Sequence[bool]):
         super().__init__(code, vector, active)
         self._eliminated = {x: ProgramDerivative(self, f"newton_{x}", "eliminated") for x in self.corrections}
-        self.places.add("linearization", max(x.stored for x in self._eliminated.values()))
+        self.places.add("linearization", max(x.stored_size for x in self._eliminated.values()))
 
     def _write_correction(self, x: str):
         self._eliminated[x].evaluation()

@@ -52,7 +52,7 @@ class LeastNormCorrection:
 
     def __init__(self, module: Module, name: str, rows: WeightedRows):
         self._module, self._name, self._x, self._rows = module, name, name[-1], rows
-        self.stored = 2 * module.n + module.m
+        self.stored_size = 2 * module.n + module.m
         self._residual = "psi" if self._x == "q" else "psi_dot"
         self._program = module.code.of("psi_q", self._residual, "root")
         fixed = {"t", "sines"} if module.moving else {"t", "sines", "constants"}

@@ -23,9 +23,9 @@ class Differentiated(Trajectory):
         self.of_accelerations = ProgramDerivative(self, "accelerations")
         self.of_projection = ProgramDerivative(self, "projection") if plan.projected else None
         for i in range(1, self.last + 1):  # the last is at the end of the step
-            self.places.add(f"stage{i} linearization", self.of_accelerations.stored)
+            self.places.add(f"stage{i} linearization", self.of_accelerations.stored_size)
         if self.of_projection:
-            self.places.add("projection linearization", self.of_projection.stored)
+            self.places.add("projection linearization", self.of_projection.stored_size)
 
     def evaluate_stage(self, f: Function, i: int):
         """Compute the accelerations of stage i with the intermediate results that derivatives need."""

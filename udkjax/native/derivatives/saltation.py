@@ -21,7 +21,7 @@ NO_JUMP = 100 * EDGE_STEP  # a smaller relative difference is no jump: a step ac
 
 def add_memory(module: Differentiated):
     """Reserve memory for the linearization before a step across, and for three tangents, the first of which is the motion."""
-    module.places.add(LINEARIZATION_BEFORE, module.of_accelerations.stored)
+    module.places.add(LINEARIZATION_BEFORE, module.of_accelerations.stored_size)
     module.places.add(MOTION_TANGENTS, len(module.ways) * module.tangents.size * (module.tangents.width // module.plan.width))
 
 

@@ -40,7 +40,7 @@ SETTINGS = (
     "max_steps",
     "method",
     "drift_tol",
-    "most_rank",
+    "max_rank",
     "open_tol",
 )
 INPUTS = ("numbers", "ts", "q", "v", "settings", "rows", "breaks")

@@ -31,7 +31,7 @@ GIVEN_DIRECTIONS = ("d", "e")  # directions of numbers and of initial states, wh
 class ProgramDerivative:
     """The writer of one of the scene's differentiable programs, and of its derivative, as functions of a module."""
 
-    stored: int
+    stored_size: int
     """The number of intermediate results that its derivatives need."""
 
     def __init__(self, module: Module, name: str, evaluation: str = "evaluation", slopes: Layout | None = None):
@@ -51,19 +51,19 @@ class ProgramDerivative:
         self._evaluated: DifferentiableProgram = code.differentiable.of(*DIFFERENTIATED_OUTPUTS[name])
         self._fixed = [] if module.moving and slopes is None else ["constants"]
         self._stored: dict[str, int] = {}  # offsets of the arrays of loops
-        self.stored = 0
+        self.stored_size = 0
         if module.unrolled:
             self._unrolled = (
                 module.unrolled.derivative(*DIFFERENTIATED_OUTPUTS[name]) if slopes is None else module.unrolled.slopes
             )
-            self.stored = sum(x == "stored" for x, _ in self._unrolled.evaluation.outputs)
+            self.stored_size = sum(x == "stored" for x, _ in self._unrolled.evaluation.outputs)
             return
         parts = self._evaluated.second_parts if self._mode == TWICE else self._evaluated.parts
         used = self._evaluated.program.arrays | LoopProgram(parts).arrays
         for x, count in module.code.stored_sizes.items():
             if x in used:
-                self._stored[x] = self.stored
-                self.stored += count
+                self._stored[x] = self.stored_size
+                self.stored_size += count
         if "along" not in module.places.places:  # tangents or cotangents of stored values, shared by all such programs
             module.places.add("along", len(PREFIXES[module.mode]) * sum(module.code.stored_sizes.values()))
 

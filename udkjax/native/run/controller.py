@@ -142,7 +142,7 @@ def _accept_step(module: Module, f: Function, s: Lane, accept: Value) -> Value:
         if rank is not None:
             # Rows that depend on others along the whole motion are independent where these are violated, or by rounding, unless
             # the threshold of the rank is larger: they then hold back what is free to move.
-            is_held = accept & (rank > s.most_rank) & lost.value.is_(0.0)
+            is_held = accept & (rank > s.max_rank) & lost.value.is_(0.0)
             lost.value = f.select(is_held, f.const(Status.SPURIOUS_RANK, DOUBLE, f.width), lost.value)
         if module.m:
             s.where(accept, tolerance=velocity_tolerance(module, f, s, "point3 v"))

@@ -28,8 +28,8 @@ def write_begin(module: Module):
             put(name, 0.0)
     given_settings = module.member_address(f, "settings", member)
     settings = dict.fromkeys(SETTINGS, f.const(1.0)) | {name: f.load(given_settings, j) for j, name in enumerate(module.settings)}
-    if "most_rank" in module.settings and module.code.marks_rows and not module.code.weighs_rows:
-        settings["most_rank"] = _marked_rank(module, f, member, settings["most_rank"])
+    if "max_rank" in module.settings and module.code.marks_rows and not module.code.weighs_rows:
+        settings["max_rank"] = _marked_rank(module, f, member, settings["max_rank"])
     for name, value in settings.items():
         put(name, value)
     q, v = module.member_address(f, "q", member), module.member_address(f, "v", member)

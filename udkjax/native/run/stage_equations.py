@@ -57,7 +57,7 @@ class StageEquations:
             w.add(name, n)
         self._slopes = ProgramDerivative(module, "accelerations", slopes=w)
         p = module.places
-        p.add("slopes linearization", self._slopes.stored)
+        p.add("slopes linearization", self._slopes.stored_size)
         p.add("slope tangent", w.size * self._group)
         begin = p.size
         for name in ("residual a", "guess a", "weight q", "weight v"):
