@@ -83,10 +83,10 @@ from udkjax.scene.numbers.named_numbers import numbers_in_expressions as numbers
 from udkjax.scene.numbers.number_fields import NumberField as NumberField
 from udkjax.scene.numbers.number_fields import split_index as split_index
 from udkjax.scene.numbers.origin import Origin as Origin
+from udkjax.scene.numbers.quantities import conversion_factor as conversion_factor
+from udkjax.scene.numbers.quantities import read_quantity as read_quantity
 from udkjax.scene.numbers.sources import AbstractDrawing as AbstractDrawing
 from udkjax.scene.numbers.units import NUMBERS as NUMBERS
-from udkjax.scene.numbers.units import conversion_factor as conversion_factor
-from udkjax.scene.numbers.units import read_quantity as read_quantity
 from udkjax.scene.outlines.outline import Outline as Outline
 from udkjax.scene.outlines.outline import RoundHole as RoundHole
 from udkjax.scene.outlines.outline import read_outline as read_outline

@@ -9,8 +9,13 @@ import pytest
 from numpy.testing import assert_allclose
 
 import udkjax.scene as udk
+from tests.elements import BODIES, DRIVERS, FORCES, JOINTS
 from udkjax.scene.drawing import Drawing
-from udkjax.scene.numbers.units import read_quantity
+from udkjax.scene.drawing.drawing_reader import units_of_element
+from udkjax.scene.drawing.drawn_quantities import Units
+from udkjax.scene.numbers.quantities import read_quantity
+from udkjax.scene.tables.element_setup import as_leaves
+from udkjax.scene.tables.schema import build, table_of
 
 HEAD = "format = 2\n"
 MM = HEAD + 'units = {length = "mm", angle = "deg"}\n'
@@ -301,3 +306,40 @@ def test_a_file_of_a_wrong_drawing_is_named(tmp_path):
     path.write_text(HEAD + PINS + CRANK)
     with pytest.raises(udk.SceneError, match=r"wrong\.toml"):
         udk.load(path)
+
+
+SAMPLES = {
+    "torque": udk.Torque(["a", "b"], udk.Held([0.7, -0.2], 0.5, 0.1)),
+    "force": udk.Force("a", udk.Held([[1.0, 2.0], [3.0, 4.0]], 0.5, 0.1)),
+    "servo": udk.TorsionSpring(["a", "b"], 3.0, angle=udk.Held([0.1, 0.2], 0.5, 0.1)),
+}
+# Units that all differ from SI's.
+OTHER_UNITS = {"length": "mm", "angle": "deg", "mass": "g", "time": "ms", "force": "kN", "torque": "N mm", "density": "g/cm3"}
+OTHER_UNITS |= {"inertia": "g mm2", "velocity": "mm/s", "angular_velocity": "rpm", "acceleration": "g", "stiffness": "N/mm"}
+OTHER_UNITS |= {"damping": "N s/mm", "torsional_stiffness": "N mm/rad", "torsional_damping": "N mm s/rad"}
+
+
+def numbers_by_place(table, place=()):
+    """Return the numbers of nested tables and lists by the keys and indices that lead to them."""
+    if isinstance(table, dict | list):
+        items = table.items() if isinstance(table, dict) else enumerate(table)
+        return {k: x for key, value in items for k, x in numbers_by_place(value, (*place, key)).items()}
+    return {place: table} if not isinstance(table, bool | tuple) and table is not None and table != "ground" else {}
+
+
+@pytest.mark.parametrize("element", [*BODIES.values(), *JOINTS.values(), *DRIVERS.values(), *FORCES.values(), *SAMPLES.values()])
+def test_every_number_of_an_element_is_written_and_read_in_the_units_of_the_file(element):
+    """All numbers but those without a unit change, and come back."""
+    cls = type(element)
+    variant, law = units_of_element(cls, table_of(element))
+    si, other = (Units(units).write_table(element, variant, law) for units in ({}, OTHER_UNITS))
+    problems = []
+    back = build(cls, Units(OTHER_UNITS).convert_table("x", cls, other, problems, variant, law))
+    assert problems == []
+    for x, y in zip(jax.tree.leaves(element), jax.tree.leaves(as_leaves(back)), strict=True):
+        assert_allclose(y, x, rtol=1e-15)
+    written, unchanged = numbers_by_place(other), set()
+    for place, value in numbers_by_place(si).items():
+        if isinstance(value, float) and value and written[place] == value:
+            unchanged.add(next(key for key in reversed(place) if isinstance(key, str)))
+    assert unchanged == set()

@@ -8,6 +8,7 @@ import pytest
 from jax.core import Tracer
 
 import udkjax as udk
+from udkjax.scene.drawing.drawn_quantities import Units
 from udkjax.scene.numbers.formula import Measured, evaluate, names_in
 
 TEXT = """format = 2
@@ -203,6 +204,68 @@ def test_expressions_compute_in_the_units_of_the_drawing():
         assert found.unit == unit, text
     assert names_in("2*r + sin(q1) + pi") == ("r", "q1")
     assert names_in("r; import os") is names_in("r.real") is names_in("[r]") is names_in("f(r)") is None
+
+
+QUANTITIES = {"F": "100 N", "k": "2 N/mm", "v": "100 mm/s", "t": "500 ms", "T": "10 N m", "r": "50 mm", "w": "60 rpm"}
+QUANTITIES |= {"m": "200 g", "a": "90 deg", "J": "0.3 kg m2", "n": 3.0, "half": "r/2", "area": "r**2", "c": "2 N m/rad"}
+
+
+@pytest.mark.parametrize(
+    "units", [{}, {"length": "mm", "angle": "deg"}, {"force": "kN", "torque": "N mm", "time": "ms", "mass": "g"}]
+)
+@pytest.mark.parametrize(
+    ("text", "unit", "value"),
+    [
+        ("F/k", "m", 0.05),
+        ("v*t", "m", 0.05),
+        ("k*r", "N", 100.0),
+        ("T/r + F", "N", 300.0),
+        ("w*t", "rad", np.pi),
+        ("w*r - v", "m/s", 0.1 * np.pi - 0.1),
+        ("n*half", "m", 0.075),
+        ("n/t", "rad/s", 6.0),
+        ("area/half", "m", 0.1),
+        ("sqrt(area + 3*r^2)", "m", 0.1),
+        ("sqrt(k/m)", "rad/s", 100.0),
+        ("m*r**2", "kg m2", 5e-4),
+        ("hypot(w*r, v)", "m/s", np.hypot(0.1 * np.pi, 0.1)),
+        ("atan2(v*t, r)", "rad", np.pi / 4),
+        ("c*a", "N m", np.pi),
+        ("J*w/t", "N m", 1.2 * np.pi),
+        ("F*r/(k*half)", "m", 0.1),
+        ("r/half", "", 2.0),
+        ("sin(w*t/6)", "", 0.5),
+        ("abs(-T)", "N m", 10.0),
+    ],
+)
+def test_products_of_quantities_do_not_depend_on_the_units_of_the_file(text, unit, value, units):
+    drawing_units, problems = Units(units), []
+    drawing_units.read_numbers(QUANTITIES, problems)
+    found = drawing_units.convert("x", text, unit, problems)
+    assert problems == [] and found == pytest.approx(value, rel=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("text", "unit", "message"),
+    [
+        ("r**2", "m", '"r**2" is measured in m2; m is needed here'),
+        ("F*v", "N", '"F*v" is measured in m2 kg/s3; N is needed here'),
+        ("1/t", "m", '"1/t" is measured in 1/s; m is needed here'),
+        ("a", "", '"a" is measured in rad; a number without a unit is needed here'),
+        ("w*r + F", "m/s", "it adds a quantity in m rad/s and one in N"),
+        ("hypot(r, t)", "m", "hypot of a quantity in m and one in s"),
+        ("2**t", "m", "an exponent must be a plain number, not a quantity in s"),
+        ("r**n", "m", "the power of a quantity in m needs an exponent without named numbers"),
+        ("sqrt(r)", "m", "a quantity in m to the power 0.5 has no unit"),
+        ("asin(r)", "rad", "asin needs a plain number, such as a ratio, not a quantity in m"),
+        ("cos(r/t)", "", "cos needs an angle, not a quantity in m/s"),
+    ],
+)
+def test_expressions_of_another_quantity_are_refused(text, unit, message):
+    units, problems = Units({"length": "mm"}), []
+    units.read_numbers(QUANTITIES, problems)
+    assert units.convert("x", text, unit, problems) is None
+    assert problems == [f"x: {message}"]
 
 
 @pytest.mark.parametrize(

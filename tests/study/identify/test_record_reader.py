@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 
 import udkjax as udk
 from udkjax.positions.assembling.channels import Quantity
-from udkjax.scene.numbers.units import conversion_factor
+from udkjax.scene.numbers.quantities import conversion_factor
 from udkjax.study.identify.records.record_reader import records_of
 from udkjax.study.identify.records.records import IdentificationError, Record, Start
 

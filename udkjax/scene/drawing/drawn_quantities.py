@@ -13,41 +13,26 @@ from udkjax.annotations import TomlTable
 from udkjax.arrays import by_numpy
 from udkjax.printing import format_number
 from udkjax.scene.elements.fields import vector_as_angle
+from udkjax.scene.elements.held import Held
 from udkjax.scene.elements.profiles import AbstractProfile, profile_class
-from udkjax.scene.numbers.formula import Measured, evaluate, is_computed, name_mistake, names_in
+from udkjax.scene.numbers.formula import Measured, evaluate, in_si, is_computed, name_mistake, names_in
 from udkjax.scene.numbers.named_numbers import NamedNumber
-from udkjax.scene.numbers.sources import AbstractDrawing
-from udkjax.scene.numbers.units import (
-    MOTION_LAW_FIELDS,
+from udkjax.scene.numbers.quantities import (
+    QUANTITY_KINDS,
     QUANTITY_PATTERN,
     conversion_factor,
     dimension_of,
-    field_unit,
     read_quantity,
+    unit_of,
     unit_sizes,
 )
-from udkjax.scene.tables.schema import CLASSES_BY_TYPE, keys, table_of, type_name
+from udkjax.scene.numbers.sources import AbstractDrawing
+from udkjax.scene.numbers.units import MOTION_LAW_FIELDS, field_unit
+from udkjax.scene.tables.schema import CLASSES_BY_TYPE, keys, table_of, type_name, with_samples
 from udkjax.wording import abbreviate, quote, suggestion
 
-# Quantities whose units a file may choose, with their SI units, the default.
-QUANTITY_KINDS = {
-    "length": "m",
-    "angle": "rad",
-    "mass": "kg",
-    "time": "s",
-    "force": "N",
-    "torque": "N m",
-    "density": "kg/m3",
-    "inertia": "kg m2",
-    "velocity": "m/s",
-    "angular_velocity": "rad/s",
-    "acceleration": "m/s2",
-    "stiffness": "N/m",
-    "damping": "N s/m",
-    "torsional_stiffness": "N m/rad",
-    "torsional_damping": "N m s/rad",
-}
 _KIND_OF = {unit: kind for kind, unit in QUANTITY_KINDS.items()}
+HELD_TIMES = ("dt", "t0")  # the fields of a `Held` that are times
 VECTOR_FIELDS = ("axis", "to_axis", "direction", "face")  # angles that may also be vectors
 
 
@@ -173,9 +158,11 @@ class Units:
         """Return a named number in the units of the file, with the SI unit of its quantity: "" for a number without a unit."""
         if not named.unit:
             return Measured(named.value, "")
-        kind = kind_of(named.unit)
-        factor = conversion_factor(named.unit, kind) / self.size_of(kind)
-        return Measured(named.value if factor == 1.0 else by_numpy(named.value) * factor, kind)
+        unit = unit_of(dimension_of(named.unit))
+        if unit not in QUANTITY_KINDS.values():
+            raise ValueError(f"{quote(named.unit)} measures no quantity of a drawing: {', '.join(QUANTITY_KINDS)}")
+        factor = conversion_factor(named.unit, unit) / self.size_of(unit)
+        return Measured(named.value if factor == 1.0 else by_numpy(named.value) * factor, unit)
 
     def size_of(self, unit: str) -> float:
         """Return the size, in an SI unit, of the unit in which expressions have their values: the file's, by default SI's."""
@@ -190,14 +177,12 @@ class Units:
             except ValueError:
                 if not is_computed(text) or not (self.numbers or len(names) == 0):
                     raise
-        value, own = evaluate(text, self.numbers, self.size_of)
-        if own and own != unit:
-            raise ValueError(f"{quote(text)} is measured in {own}; {unit or 'a number without a unit'} is needed here")
-        if own != unit and self._factor(unit) is None:
+        found = evaluate(text, self.numbers, self.size_of)
+        value = in_si(text, found, unit, self.size_of)
+        if not found.unit and self._factor(unit) is None:
             raise ValueError(f"{quote(text)} needs a unit: give one of its numbers with its unit, such as {quote(f'1 {unit}')}")
         self.expressions.append(Expression(path, text, unit))
-        factor = self.size_of(unit) if unit else 1.0
-        return value if factor == 1.0 else value * factor
+        return value
 
     def _plain(self, value: object, unit: str) -> object:
         if isinstance(value, bool) or not isinstance(value, int | float | np.number | np.ndarray | jax.Array) or not unit:
@@ -259,7 +244,9 @@ class Units:
         """Return an element as a table in the units of the file, from which `convert_table` reads the same numbers."""
         cls, table = type(element), {}
         for name, value in table_of(element).items():
-            if isinstance(value, eqx.Module):
+            if isinstance(value, Held):
+                table[name] = self._write_samples(value, _unit(cls, name, variant, law))
+            elif isinstance(value, eqx.Module):
                 kind = {} if isinstance(value, AbstractProfile) else {"type": type_name(type(value))}
                 nested = self.write_table(value, law=law)
                 table[name] = {**kind, **{key: x for key, x in nested.items() if x is not False}}
@@ -268,9 +255,15 @@ class Units:
             elif name == "coefficients":
                 table[name] = [self.write(x, _per_power(law, k)) for k, x in enumerate(np.asarray(value).tolist())]
             else:
-                unit = _unit(cls, name, variant, law)
-                table[name] = jax.tree.map(lambda x, unit=unit: self.write(x, unit), np.asarray(value).tolist())
+                table[name] = self._write_numbers(value, _unit(cls, name, variant, law))
         return table
+
+    def _write_numbers(self, values: Any, unit: str) -> Any:
+        return jax.tree.map(lambda x: self.write(x, unit), np.asarray(values).tolist())
+
+    def _write_samples(self, held: Held, unit: str) -> dict[str, object]:
+        """Return a `Held` as a table, with the samples of a number in the SI unit `unit`."""
+        return {name: self._write_numbers(x, "s" if name in HELD_TIMES else unit) for name, x in table_of(held).items()}
 
     def convert_table(
         self, path: str, cls: type, table: TomlTable, problems: list[str], variant: str = "", law: str = ""
@@ -281,13 +274,17 @@ class Units:
         """
         expected, converted = keys(cls), {}
         for name, value in table.items():
-            key_path = f"{path}.{name}"
-            if name not in expected or not _is_number(expected[name].annotation):
-                converted[name] = (
-                    self._convert_nested(key_path, expected[name].annotation, value, problems, law) if name in expected else value
-                )
+            key_path, unit = f"{path}.{name}", _unit(cls, name, variant, law)
+            if name not in expected:
+                converted[name] = value
                 continue
-            unit = _unit(cls, name, variant, law)
+            annotation, sampled_class = with_samples(expected[name].annotation)
+            if sampled_class and isinstance(value, sampled_class | Mapping):
+                converted[name] = self._convert_samples(key_path, value, unit, problems)
+                continue
+            if not _is_number(annotation):
+                converted[name] = self._convert_nested(key_path, annotation, value, problems, law)
+                continue
             if isinstance(value, np.ndarray | jax.Array) and value.ndim > 0 and name in (*VECTOR_FIELDS, "coefficients"):
                 value = list(value)
             if name in VECTOR_FIELDS and isinstance(value, list | tuple):
@@ -300,21 +297,20 @@ class Units:
                 converted[name] = self.convert(key_path, value, unit, problems)
         return converted
 
+    def _convert_samples(self, path: str, held: Held | TomlTable, unit: str, problems: list[str]) -> dict[str, object]:
+        """Convert the table of a `Held`, with the samples of a number in the SI unit `unit`, to SI units."""
+        table = table_of(held) if isinstance(held, Held) else held
+        units = {name: "s" if name in HELD_TIMES else unit for name in keys(Held)}
+        return {
+            name: self.convert(f"{path}.{name}", x, units[name], problems) if name in units else x for name, x in table.items()
+        }
+
     def _convert_nested(self, path: str, annotation: Any, value: object, problems: list[str], law: str) -> object:
         """Convert the table of a motion law or of a profile to SI units; return anything else unchanged."""
         if not isinstance(value, Mapping) or not (isinstance(annotation, type) and issubclass(annotation, eqx.Module)):
             return value
         cls = profile_class(value) if annotation is AbstractProfile else CLASSES_BY_TYPE["motion"].get(str(value.get("type")))
         return value if cls is None else self.convert_table(path, cls, value, problems, law=law)
-
-
-def kind_of(unit: str) -> str:
-    """Return the SI unit of the quantity that has a unit, such as "m" for "mm"; raise a `ValueError` for an unknown unit."""
-    dimension = dimension_of(unit)
-    for kind in QUANTITY_KINDS.values():
-        if dimension_of(kind) == dimension:
-            return kind
-    raise ValueError(f"{quote(unit)} measures no quantity of a drawing: {', '.join(QUANTITY_KINDS)}")
 
 
 def without_failed(mistakes: Iterable[str], failed: Iterable[str]) -> list[str]:

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 from udkjax.arrays import array_namespace, by_numpy, make_module, number
 from udkjax.printing import PrintsLine
 from udkjax.scene.elements.fields import given_number
-from udkjax.scene.numbers.formula import Measured, evaluate, names_in
+from udkjax.scene.numbers.formula import Measured, evaluate, in_si, names_in
 
 ElementsByName = Mapping[str, Mapping[str, Any]]  # by section and name
 
@@ -86,11 +86,11 @@ def with_expressions(
     changed, measured = {section: dict(group) for section, group in groups.items()}, dict(measured)
     whole: dict[tuple[str, str, tuple[str, ...]], dict[tuple[int, ...], Any]] = {}
     for formula in formulas:
-        value, unit = evaluate(formula.text, measured, size)
+        found = evaluate(formula.text, measured, size)
         if formula.section == "number":
-            measured[formula.owner] = Measured(value, unit)
-        factor = size(formula.unit) if formula.unit else 1.0
-        whole.setdefault(formula[:3], {})[formula.at] = value if factor == 1.0 else value * factor
+            measured[formula.owner] = found
+        value = found.value if formula.section == "number" else in_si(formula.text, found, formula.unit, size)
+        whole.setdefault(formula[:3], {})[formula.at] = value
     for (section, owner, path), entries in whole.items():
         element = changed[section][owner]
         changed[section][owner] = _set(element, path, _assembled(_at(element, path), entries))

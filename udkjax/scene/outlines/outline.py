@@ -11,7 +11,7 @@ from jaxtyping import Float
 from udkjax.printing import PrintedTable, format_number, prints_table
 from udkjax.requirements import ArgumentError, require_names, require_number, require_text
 from udkjax.scene.drawing.link import Link
-from udkjax.scene.numbers.units import conversion_factor
+from udkjax.scene.numbers.quantities import conversion_factor
 from udkjax.scene.outlines.contours import Contour, DrawnPiece, contains, contours_of
 from udkjax.scene.outlines.curves import Arc, Bezier, moments
 from udkjax.scene.outlines.dxf import read_dxf

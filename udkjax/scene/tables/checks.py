@@ -4,7 +4,6 @@ import dataclasses
 import unicodedata
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cache
-from types import UnionType
 from typing import Any, Literal, NamedTuple, get_args, get_origin
 
 import equinox as eqx
@@ -24,7 +23,7 @@ from udkjax.scene.elements.held import Held
 from udkjax.scene.elements.joints import Cam, Prismatic, Revolute, Slot
 from udkjax.scene.elements.profiles import AbstractProfile, LawProfile, profile_class
 from udkjax.scene.elements.rolling import Wheel
-from udkjax.scene.tables.schema import CLASSES_BY_TYPE, CLASSES_WITHOUT_TYPE, is_in_format, keys, table_of
+from udkjax.scene.tables.schema import CLASSES_BY_TYPE, CLASSES_WITHOUT_TYPE, is_in_format, keys, table_of, with_samples
 from udkjax.wording import LONGEST_QUOTE, abbreviate, quote, suggestion, unknown_key
 
 ListSizes = dict[str, tuple[int, str]]  # by named dimension: its length, and the name of the list that has it
@@ -199,11 +198,10 @@ def check_table(where: str, cls: type, table: TomlTable, known: KnownNames) -> I
 def _check_value(path: str, annotation: Any, value: object, metadata: FieldMetadata, sizes: ListSizes) -> Iterator[str]:
     """Iterate over the mistakes in one value. `sizes` collects the lengths of the named dimensions."""
     value = value.value if isinstance(value, StaticValue) else value
-    if get_origin(annotation) is UnionType:  # a number, or samples of it
-        annotation, sampled_class = get_args(annotation)
-        if isinstance(value, sampled_class | dict):
-            yield from _check_held(path, annotation.dim_str.split(), value)
-            return
+    annotation, sampled_class = with_samples(annotation)
+    if sampled_class and isinstance(value, sampled_class | dict):
+        yield from _check_held(path, annotation.dim_str.split(), value)
+        return
     if hasattr(annotation, "dim_str"):
         yield from _check_number(path, annotation.dim_str.split(), value, metadata, sizes)
     elif get_origin(annotation) is Literal:

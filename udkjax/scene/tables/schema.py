@@ -86,6 +86,14 @@ def keys(cls: type) -> Mapping[str, Key]:
     return MappingProxyType(keys_by_name)
 
 
+def with_samples(annotation: Any) -> tuple[Any, type | None]:
+    """Return the annotation of a plain number, and the class of its samples; any annotation without samples, and None."""
+    if get_origin(annotation) is not types.UnionType:
+        return annotation, None
+    number, sampled_class = get_args(annotation)
+    return number, sampled_class
+
+
 def table_of(element: eqx.Module) -> dict[str, object]:
     """Return an element as a table, without keys whose value None means that they are absent; nested modules stay modules."""
     table = {name: getattr(element, key.field) for name, key in keys(type(element)).items()}
@@ -106,9 +114,8 @@ def build(annotation: Any, value: object) -> Any:
         return (
             str(value) if isinstance(value, np.str_) else value
         )  # NumPy's strings count as arrays, as when one is chosen at random
-    if get_origin(annotation) is types.UnionType:  # a number, or samples of it
-        annotation = get_args(annotation)[1]
-    annotation = profile_class(value) if annotation is AbstractProfile else annotation
+    number, sampled_class = with_samples(annotation)
+    annotation = profile_class(value) if annotation is AbstractProfile else sampled_class or number
     cls = CLASSES_BY_TYPE["motion"][value["type"]] if "type" in value else annotation
     expected = keys(cls)
     return cls(**{expected[name].field: build(expected[name].annotation, item) for name, item in value.items() if name != "type"})

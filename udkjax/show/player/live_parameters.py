@@ -12,7 +12,7 @@ from udkjax.integrate.portable import scalar_parameters
 from udkjax.scene.drawing import Drawing
 from udkjax.scene.drawing.drawn_quantities import Units
 from udkjax.scene.mechanism import Mechanism
-from udkjax.scene.numbers.units import conversion_factor
+from udkjax.scene.numbers.quantities import conversion_factor
 
 # Names of parameters or of their entries, alone or with the ranges of their sliders; True: all parameters.
 Live = bool | Sequence[str] | Mapping[str, tuple[float, float] | None]

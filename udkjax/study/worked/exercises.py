@@ -17,7 +17,7 @@ from udkjax.scene.drawing import Drawing
 from udkjax.scene.drawing.drawn_quantities import Units
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.numbers.number_fields import split_index
-from udkjax.scene.numbers.units import conversion_factor
+from udkjax.scene.numbers.quantities import conversion_factor
 from udkjax.scene.tables.checks import SceneError
 from udkjax.study.worked.page import sheet_of
 from udkjax.study.worked.solution import WorkedSolution, worked_solution

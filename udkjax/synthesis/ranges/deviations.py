@@ -9,7 +9,7 @@ from scipy.special import ndtr, ndtri
 
 from udkjax.requirements import require_choice, require_number, require_numbers, require_text
 from udkjax.scene.drawing.drawn_quantities import Units
-from udkjax.scene.numbers.units import conversion_factor, read_quantity
+from udkjax.scene.numbers.quantities import conversion_factor, read_quantity
 from udkjax.wording import quote
 
 DeviationKind = Literal["normal", "uniform", "truncated"]

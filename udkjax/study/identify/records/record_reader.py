@@ -10,7 +10,7 @@ import numpy as np
 
 from udkjax.annotations import Numbers
 from udkjax.positions.assembling.channels import Channel, Quantity, channel_of
-from udkjax.scene.numbers.units import conversion_factor
+from udkjax.scene.numbers.quantities import conversion_factor
 from udkjax.study.identify.records.records import ByChannel, ChannelKey, IdentificationError, Noise, Record, key_of
 from udkjax.study.identify.records.tables import NOISE_SUFFIX, RECORD_HEADING, TIME_HEADINGS, Table, TableData, read_tables
 from udkjax.study.quantities import StudyModel
