@@ -120,8 +120,9 @@ def read_drawing(
     if not is_traced((groups["pin"], groups["link"])):
         drawn = concrete_elements(groups)
         problems += shape_mistakes(drawn["pin"], drawn["link"], {slot.pin for slot in drawn["slot"].values()})
-        if not problems:
-            problems += gap_mistakes(placement_of(drawn, fixed_pins), drawn)
+        if not problems and not is_traced([groups[section] for section in ("slide", "slot", "gear", "cam")]):
+            with jax.ensure_compile_time_eval():  # concrete even while something else is traced
+                problems += gap_mistakes(placement_of(drawn, fixed_pins), drawn)
     return DrawingElements(groups, gravity, problems, tuple(formulas))
 
 

@@ -205,20 +205,23 @@ class CamPair(DrawnElement):
         """Return the profile with the numbers that are not given, from the drawn place of the follower and its slide or pivot."""
         cam = self._pair(placement)[0]
         centre, point = (placement.places[pin] for pin in self.pins)
-        arm, numbers = point - centre, {}
-        xp = array_namespace(arm)
-        toward = xp.arctan2(arm[1], arm[0]) if self.face is None else by_numpy(self.face)
+        arm, face, numbers = point - centre, None if self.face is None else by_numpy(self.face), {}
+        place = axis = None
         if isinstance(profile, SwingProfile):
             place = placement.places[self._pivot(placement) or ""]
+        elif face is None and (slide := self._slide(placement)):
+            axis = placement.direction(slide.on, slide.along, slide.direction) + placement.angle(slide.on)
+        xp = array_namespace([x for x in (arm, face, place, axis) if x is not None])
+        toward = xp.arctan2(arm[1], arm[0]) if face is None else face
+        if place is not None:
             line, x, y = place - centre, xp.cos(toward), xp.sin(toward)
             left = line[0] * y - line[1] * x >= 0
             distance = norm(line)
             numbers["pivot"] = xp.where(left, distance, -distance)
             held = point - place
-            numbers["arm"] = norm(held) if self.face is None else held[0] * x + held[1] * y
+            numbers["arm"] = norm(held) if face is None else held[0] * x + held[1] * y
             toward = xp.arctan2(line[1], line[0])
-        elif self.face is None and (slide := self._slide(placement)):
-            axis = placement.direction(slide.on, slide.along, slide.direction) + placement.angle(slide.on)
+        elif axis is not None:
             axis = axis + xp.where(xp.cos(axis - toward) < 0, np.pi, 0.0)  # away from the cam
             numbers["eccentricity"] = arm[1] * xp.cos(axis) - arm[0] * xp.sin(axis)
             toward = axis
