@@ -221,6 +221,47 @@ def test_guesses_beside_the_first():
     assert (x == u.values(sample_guesses(u, np.zeros(3), 64, 0))).all()
 
 
+# --- few samples, and numbers without influence
+
+
+@pytest.mark.parametrize("times", [[0.0], [5.0], [1.7e9], [0.0, 0.1]])
+@pytest.mark.parametrize("since", [0.0, 0.5])
+@pytest.mark.parametrize("strategy", ["auto", "pieces"])
+def test_few_samples(times, since, strategy):
+    record = udk.Record(times, {ANGLE: [0.7, 0.9][: len(times)]}, t0=times[0] - since)
+    estimate = found(pendulum(), record, ["body.rod.inertia"], n_starts=1, strategy=strategy)
+    data = estimate.to_xarray()
+    assert data["measured"].shape == data["noise"].shape == (1, len(times), 1)
+    assert "records in pieces" not in estimate.ways
+    (noise,) = estimate.to_dict()["noise"]
+    is_known = len(times) > 1 or not since  # the first sample of a motion does not depend on the parameter
+    assert list(noise) == [ANGLE] and (noise[ANGLE] is not None) == is_known
+    assert ("too few to estimate the noise" not in estimate.message) == is_known
+    assert ("estimated noise" in str(estimate)) == is_known
+
+
+@pytest.fixture(scope="module")
+def driven():
+    """A slider-crank at constant speed, and the torque of its motor over time."""
+    crank = udk.library.slider_crank()
+    motor = udk.Driver(("ground", "crank"), "angle", udk.Polynomial([crank.q0[0, 2], 5.0]))
+    mech = udk.Mechanism(crank.bodies, crank.joints, drivers={"motor": motor})
+    ts = np.linspace(0.0, 1.0, 15)
+    return mech, ts, np.asarray(udk.efforts(mech, udk.simulate(mech, ts))["motor"])
+
+
+@pytest.mark.parametrize("factor", [1.0, 1.5])
+@pytest.mark.parametrize("strategy", ["auto", "pieces"])
+def test_what_changes_nothing_but_rounding_errors_is_undetermined(driven, factor, strategy):
+    """The crank turns steadily whatever its inertia; as all motion is prescribed, pieces have no states of their own."""
+    mech, ts, torque = driven
+    data = {"time": ts, "driver.motor.load": factor * torque}
+    estimate = found(mech, data, ["body.crank.inertia"], n_starts=4, strategy=strategy)
+    assert not estimate.success and estimate.uncertainty.dead == ("body.crank.inertia",)
+    assert estimate.converged and estimate.values[0] == mech.parameters()["body.crank.inertia"]
+    assert estimate.message.startswith("no measured quantity depends on body.crank.inertia")
+
+
 # --- bad input
 
 

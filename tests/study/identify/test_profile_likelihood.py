@@ -111,6 +111,11 @@ def test_few_steps_leave_it_open():
     assert found.interval == (-np.inf, np.inf) and "(not reached in 5 steps)" in found.text and len(found.values) == 11
 
 
+def test_steps_below_the_rounding_of_the_unknown_end_the_walk():
+    found = trace_profile(curve(lambda z: 0.0), 0, np.array([1e9]), 0.0, 1e-9, bounds=(0.0, 2e9))
+    assert found.interval == (-np.inf, np.inf) and len(found.values) == 1
+
+
 def test_a_better_fit_on_the_way_is_said():
     """There is a second, lower minimum at 1."""
 

@@ -9,6 +9,7 @@ import xarray
 from numpy.testing import assert_allclose
 
 import udkjax as udk
+from udkjax.cli.datasets import save
 from udkjax.positions.assembling.channels import Quantity
 from udkjax.scene.numbers.quantities import conversion_factor
 from udkjax.study.identify.records.record_reader import records_of
@@ -275,6 +276,54 @@ def test_what_a_solution_writes_can_be_measured(mech):
     assert_allclose(record.values["body.slider.vy"], v[:, 2, 1])
     other = data.assign_coords(body=["crank", "rods", "slider"])
     assert problems(mech, other[["q"]]) == ['data, "q": no body named "rods"; did you mean "rod"?']
+
+
+@pytest.fixture(scope="module")
+def with_motors():
+    """A mechanism with two drivers, and the dataset of a run of it with events."""
+    still = udk.library.slider_crank()
+    drivers = {
+        name: udk.Driver(("ground", body), "angle", udk.Polynomial([0.0])) for name, body in (("motor", "crank"), ("idle", "rod"))
+    }
+    mech = udk.Mechanism(still.bodies, still.joints, drivers=drivers)
+    ts, count = np.array([0.0, 0.5]), len(mech.body_names)
+    dims = "time", "body", "coordinate"
+    coords = {"time": ts, "body": list(mech.body_names), "coordinate": ["x", "y", "angle"], "driver": list(drivers)}
+    data = xarray.Dataset({"q": (dims, np.ones((2, count, 3))), "v": (dims, np.ones((2, count, 3)))}, coords)
+    data["effort"] = ("time", "driver"), np.array([[1.0, 2.0], [3.0, 4.0]]), {"units": "N m or N"}
+    data["holds"] = ("time", "constraint"), np.ones((2, 1), np.int8)
+    return mech, data.assign_coords(constraint=["stop"])
+
+
+@pytest.mark.parametrize("suffix", ["", ".nc", ".csv"])
+@pytest.mark.parametrize("with_channel", [False, True])
+def test_files_of_runs_with_drivers_and_events_are_records(with_motors, suffix, with_channel, tmp_path):
+    mech, data = with_motors
+    if with_channel:
+        data = data.assign({"driver.motor.load": ("time", [1.0, 3.0], {"units": "N m"})})
+    source = tmp_path / f"run{suffix}" if suffix else data
+    if suffix:
+        save(data, source)
+    (record,) = records_of(mech, source)
+    assert_allclose(record.values["driver.motor.load"], [1.0, 3.0])
+    assert_allclose(record.values["driver.idle.load"], [2.0, 4.0])
+    assert len(record.values) == 6 * len(mech.body_names) + 2
+
+
+def test_efforts_may_be_ignored_and_name_their_driver(with_motors):
+    mech, data = with_motors
+    (record,) = records_of(mech, data, ignore=["effort"])
+    assert not any(str(key).startswith("driver") for key in record.values)
+    (record,) = records_of(mech, data, ignore=["effort.idle"])
+    assert "driver.motor.load" in record.values and "driver.idle.load" not in record.values
+    (told,) = problems(mech, data[["effort"]].assign_coords(driver=["moter", "idle"]))
+    assert told.startswith('data, column "effort.moter": no driver named "moter"; did you mean "motor"?')
+
+
+def test_variables_of_datasets_along_other_dimensions_may_be_ignored(mech):
+    data = xarray.Dataset({"body.crank.angle": ("time", [1.0, 2.0]), "extra": ("side", [1.0])}, {"time": [0.0, 1.0]})
+    (record,) = records_of(mech, data, ignore=["extra"])
+    assert list(record.values) == ["body.crank.angle"]
 
 
 # --- units

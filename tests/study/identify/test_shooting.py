@@ -42,6 +42,17 @@ def test_each_number_is_in_one_piece(problem, pieces):
     assert pieces.K == 2 + 4 * 2 == len(pieces.all_names) == len(pieces.all_units)
 
 
+@pytest.mark.parametrize("time", [0.0, 5.0, 1.7e9])
+def test_a_record_of_one_sample_is_one_piece(measured, time):
+    records = [Record(TS, {ANGLE: measured[1]}), Record([time], {ANGLE: [1.0]})]
+    first = pendulum(0.5, 0.1)
+    together = FitProblem(first, unknowns_of(first, NAMES), records)
+    assert (np.diff(together.ts) > 100.0 * np.spacing(together.ts[:, :-1])).all()
+    assert cut_records(together, 12)[-1] == (1, 0, 1)
+    pieces = MultipleShooting(together, np.zeros(together.K), TOL, samples=6)
+    assert (np.diff(pieces.runs.ts) > 0).all() and pieces.runs.ts[pieces.run[-1], pieces.time[-1]] == time
+
+
 def test_derivatives(pieces):
     z = pieces.guess + 0.1 * np.random.default_rng(0).standard_normal(pieces.K)
     h = 1e-5

@@ -277,7 +277,8 @@ class Estimate:
         channels, first = np.unique(estimated[:, 2], return_index=True)
         found = []
         for channel, record in zip([problem.channels[c] for c in channels], estimated[first, 0], strict=True):
-            found.append(f"{channel.name} {np.nanmedian(self.noise[record][channel.name]):.3g} {channel.units}".rstrip())
+            if math.isfinite(noise := _usual_noise(self.noise[record][channel.name])):
+                found.append(f"{channel.name} {noise:.3g} {channel.units}".rstrip())
         if found:
             facts["estimated noise"] = join_names(found)
         if pairs := [f"{a} and {b} {rho:.2f}" for a, b, rho in uncertainty.correlated_beyond(PRINTED_CORRELATION)]:
@@ -356,10 +357,16 @@ class Estimate:
             "starts": {r.parameter: {"change": r.value, "standard_error": r.standard_error} for r in rows[P:]},
             "chi2": uncertainty.chi2,
             "degrees_of_freedom": uncertainty.degrees_of_freedom,
-            "noise": [{channel: np.nanmedian(sigma) for channel, sigma in table.items()} for table in self.noise],
+            "noise": [{channel: _usual_noise(sigma) for channel, sigma in table.items()} for table in self.noise],
             "outliers": self.outliers,
             "whiteness": [{"record": k, "channel": c, "p": w.p} for (k, c), w in self.whiteness.items()],
             "tolerance": self.tol[0],
             "versions": versions(),
         }
         return plain({name: getattr(self, name) for name in same} | results)
+
+
+def _usual_noise(sigma: Float[np.ndarray, "T"]) -> float:
+    """Return the median of the standard deviations of a channel; NaN if the noise is unknown."""
+    known = sigma[np.isfinite(sigma)]
+    return float(np.median(known)) if known.size else math.nan

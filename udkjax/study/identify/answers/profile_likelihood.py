@@ -243,6 +243,8 @@ def _walk(fit: FitOthers, index: int, z: np.ndarray, cost: float, step: float, b
                 max((end - psi) / (beyond - psi), MOST_SHRINK) if np.isfinite(beyond) else 0.5
             )
         fixed = sign * min(sign * (current[index] + step), sign * bound)
+        if fixed == current[index]:  # the step is below the rounding of the unknown
+            break
         fraction = 0.0 if previous is None else (fixed - current[index]) / (current[index] - previous[index])
         guess = current + fraction * (current - previous) if previous is not None else current.copy()
         guess[index] = fixed
@@ -265,7 +267,7 @@ def _walk(fit: FitOthers, index: int, z: np.ndarray, cost: float, step: float, b
             continue
         slope = (reached - psi) / abs(fixed - current[index])
         # A falling curve may lead to another minimum: do not lengthen the step.
-        wanted = abs(step) if slope < 0.0 else min(end / STEPS_TO_END, end - reached) / max(slope, np.finfo(float).tiny)
+        wanted = abs(step) if slope < 0.0 else min(end / STEPS_TO_END, end - reached) / max(slope, np.finfo(float).eps)
         step = sign * np.clip(wanted, MOST_SHRINK * abs(step), MOST_STRETCH * abs(step))
         previous, inside = current, (trial, reached)
         if fixed == bound:

@@ -40,6 +40,9 @@ from udkjax.study.identify.records.records import Estimated, IdentificationError
 from udkjax.study.quantities import StudyModel
 from udkjax.wording import suggestion
 
+# Change of a prediction, relative to its channel's scale, below which it is a rounding error of a change of an unknown by its own
+# size. A parameter on which the load of a driver does not depend changes it by 1e-14.
+VISIBLE_CHANGE = 1e-12
 STILL_DEVIATION = 1e-12  # standard deviation below which a channel is constant, relative to its largest number
 RESIDUALS_PER_UNKNOWN = 3.0  # least number in the first fitted part of a record, and in a piece; fewer would fit the noise
 # Arguments of `simulate` that `identify` sets itself.
@@ -121,17 +124,15 @@ class FitProblem:
     def by_record(self, rows: Float[np.ndarray, "R"]) -> tuple[dict[str, np.ndarray], ...]:
         """Return `rows`, a number for each measured value (R,), as a table for each record.
 
-        A table has an array (times,) for each channel with finite numbers, which is NaN where nothing was measured.
+        A table has an array (times,) for each measured channel of the record, which is NaN where nothing was measured.
         """
         table = np.full(self.y.shape, np.nan)
         table[self.present] = rows
         tables = []
         for k, record in enumerate(self.records):
             ts, first = output_times(record)
-            of_record = table[k, first : len(ts)]
-            tables.append(
-                {name: of_record[:, c] for c, name in enumerate(self.channel_names) if np.isfinite(of_record[:, c]).any()}
-            )
+            of_record, measured = table[k, first : len(ts)], self.present[k].any(0)
+            tables.append({name: of_record[:, c] for c, name in enumerate(self.channel_names) if measured[c]})
         return tuple(tables)
 
     def members(
@@ -237,8 +238,15 @@ class FitProblem:
         entries = np.searchsorted(runs, self.run[rows]), self.time[rows], self.index[rows, 2]
         r = weighted(prediction.y[:, *entries], self.measured[rows], self.sigma[rows])
         by = prediction.dy[:, *entries]
+        by[np.abs(by) * self._sizes(z)[:, None] <= VISIBLE_CHANGE * self.channel_scale[self.index[rows, 2], None]] = 0.0
         by /= self.sigma[rows, None]
         return Residuals(r, self.by_unknowns(by, self.run[rows], z), prediction.code.max(1), rows)
+
+    def _sizes(self, z: Float[np.ndarray, "B K"]) -> Float[np.ndarray, "B P+S"]:
+        """Return the sizes of the parameters, and of the unknowns of a run's initial state, which are dimensionless."""
+        by_change = self.unknowns.dx_dz(z[:, : len(self.unknowns.names)])
+        sizes = np.clip(by_change, np.abs(self.unknowns.range_scale), np.finfo(float).max)
+        return np.concatenate([sizes, np.ones((len(z), self.columns.shape[1]))], axis=1)
 
     def first_states(self, mechanism: StudyModel, z: Float[np.ndarray, "K"]) -> tuple[State, ...]:
         """Return the closed initial states of the records for a mechanism with the parameters of z."""

@@ -12,7 +12,16 @@ from udkjax.annotations import Numbers
 from udkjax.positions.assembling.channels import Channel, Quantity, channel_of
 from udkjax.scene.numbers.quantities import conversion_factor
 from udkjax.study.identify.records.records import ByChannel, ChannelKey, IdentificationError, Noise, Record, key_of
-from udkjax.study.identify.records.tables import NOISE_SUFFIX, RECORD_HEADING, TIME_HEADINGS, Table, TableData, read_tables
+from udkjax.study.identify.records.tables import (
+    EFFORTS,
+    HOLDS,
+    NOISE_SUFFIX,
+    RECORD_HEADING,
+    TIME_HEADINGS,
+    Table,
+    TableData,
+    read_tables,
+)
 from udkjax.study.quantities import StudyModel
 from udkjax.wording import abbreviate, quote, suggestion
 
@@ -31,13 +40,14 @@ def records_of(
     * a heading may name units in brackets, `time [ms]`, `body.crank.angle [deg]` (in xarray: the attribute `units`);
     * an empty cell, or one that is not a number ("nan"), is a gap;
     * `CHANNEL.noise` is the standard deviation of a channel, in the channel's units unless the heading names others;
-    * `record` is the name of the record that a row belongs to (in xarray: a dimension).
+    * `record` is the name of the record that a row belongs to (in xarray: a dimension);
+    * `effort.NAME`, in files of runs, is the channel `driver.NAME.load`.
 
     Args:
         mechanism: the mechanism with the bodies, joints and drivers that headings name.
         data: a `Record`; a mapping of "time" and channels to numbers (T,); a pandas DataFrame with such columns; an xarray
-            Dataset with such variables along "time", or with q and v as written by `Solution.to_xarray`; the path of a .csv or
-            .nc file; or a list of these.
+            Dataset with such variables along "time", or with q, v and effort as written by `Solution.to_xarray`; the path of a
+            .csv or .nc file; or a list of these.
         noise: standard deviation, in SI units, of channels without noise in the data: of all channels, or by channel.
         ignore: columns that are not read; any other column that is not a channel is a mistake.
         quantities: user-defined channels that headings may name; in Python they may also be used instead of names.
@@ -103,8 +113,11 @@ class _TableReader:
                 if of not in (*headings, *self.ignore):
                     self.add(heading, f"there is no column {quote(of)}")
                 continue
+            load = _load_of_effort(heading)
+            if load in self.columns or heading.startswith(f"{HOLDS}."):
+                continue  # a run's file may have both channel and effort, and constraints that hold
             try:
-                channel = self.channel(heading)
+                channel = self.channel(load or heading)
             except ValueError as error:
                 self.add(heading, f"{error} (list columns that are not to be read in `ignore`)")
                 continue
@@ -124,6 +137,8 @@ class _TableReader:
         They are converted from the units in the heading, or else from `units`; without either, they are not converted.
         """
         cells, own = self.columns[heading]
+        if _load_of_effort(heading) and own and " or " in own:
+            own = None  # the unit of several drivers; each is an SI unit
         scale, count, units = 1.0, len(self.table.rows), own or units
         try:
             scale = conversion_factor(units, wanted) if units else 1.0
@@ -188,6 +203,12 @@ class _TableReader:
             self.add(heading, f"the same in {len(rows) - MOST_SHOWN} more rows")
 
 
+def _load_of_effort(heading: str) -> str:
+    """Return the channel that is the effort of a driver, named as in the files of runs ("effort.NAME"); "" for other headings."""
+    section, _, driver = heading.partition(".")
+    return f"driver.{driver}.load" if section == EFFORTS and driver else ""
+
+
 def _number(cell: str | float | None) -> float:
     """Return the number in a cell: NaN if it is empty, infinite if it is not a number."""
     if cell is None or (isinstance(cell, str) and not cell.strip()):
@@ -231,7 +252,7 @@ class _DataReader:
             if isinstance(data, Iterable) and not isinstance(data, str | os.PathLike | np.ndarray | jax.Array):
                 # Its columns may be quantities.
                 self.quantities |= _quantities_by_name(cast("Iterable[Hashable]", data))
-            for table in read_tables(cast(TableData, data), self.mechanism.body_names, source, self.problems):
+            for table in read_tables(cast(TableData, data), self.mechanism.body_names, source, self.problems, self.ignore):
                 yield from _TableReader(table, self.channel, self.ignore, self.problems).records()
 
     def channel(self, given: ChannelKey) -> Channel | Quantity:

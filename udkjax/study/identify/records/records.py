@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 # Spacing of times that pad a record, relative to its length; so short that their steps cost almost nothing.
 PADDING_FRACTION = 1e-9
+PADDING_ROUNDINGS = 1000.0  # least spacing relative to the rounding of late times; runs need a hundred
 Estimated = Literal["nothing", "position", "velocity", "both"]
 ChannelKey: TypeAlias = str | Quantity  # the name of a channel, or a user-defined quantity
 T = TypeVar("T")
@@ -218,7 +219,8 @@ def output_times(record: Record) -> tuple[Float[np.ndarray, "T"], int]:
 def pad_times(ts: Float[np.ndarray, "T"], length: int) -> Float[np.ndarray, "length"]:
     """Return the times, padded to a length with slightly later times."""
     span = max(ts[-1] - ts[0], PADDING_FRACTION)
-    return np.concatenate([ts, ts[-1] + PADDING_FRACTION * span * np.arange(1, length - len(ts) + 1)])
+    spacing = max(PADDING_FRACTION * span, PADDING_ROUNDINGS * float(np.spacing(abs(ts[-1]))))
+    return np.concatenate([ts, ts[-1] + spacing * np.arange(1, length - len(ts) + 1)])
 
 
 def tabulate(records: Sequence[Record], keys: Sequence[ChannelKey]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

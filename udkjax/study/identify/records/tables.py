@@ -27,6 +27,8 @@ TableData: TypeAlias = "ByChannel[Numbers] | pandas.DataFrame | xarray.Dataset |
 # Headings of times and record names, and the suffix of a channel's noise.
 TIME_HEADINGS, RECORD_HEADING, NOISE_SUFFIX = ("time", "t"), "record", ".noise"
 _DELIMITERS = (";", "\t", ",")
+# Variables in files of runs: efforts, along drivers or in columns `effort.NAME`; and which constraints hold, no measurement.
+EFFORTS, HOLDS = "effort", "holds"
 # Coordinates in files written by `Solution.to_xarray`, as channels of bodies.
 _STATE_CHANNELS = {"q": dict(zip(COORDINATES, COORDINATES, strict=True)), "v": dict(zip(COORDINATES, RATES, strict=True))}
 
@@ -48,15 +50,19 @@ class Table(NamedTuple):
     padded: bool = False  # True if empty rows at the ends only pad the record to the length of others
 
 
-def read_tables(data: TableData, bodies: Sequence[str], source: str, problems: list[str]) -> Iterator[Table]:
+def read_tables(
+    data: TableData, bodies: Sequence[str], source: str, problems: list[str], ignore: Sequence[str] = ()
+) -> Iterator[Table]:
     """Iterate over the tables of one file or object; mistakes in it are added to `problems`.
 
     `bodies` are the names of the bodies whose states a dataset may contain, and `source` is the name of an object in messages.
+    Variables of a dataset that are in `ignore` are not read.
     """
     if isinstance(data, str | os.PathLike):
-        yield from _read_file(Path(data), bodies, problems)
+        yield from _read_file(Path(data), bodies, problems, ignore)
     elif hasattr(data, "data_vars"):
-        yield from _read_dataset(cast("xarray.Dataset", data), bodies, source, problems)
+        variables = cast("xarray.Dataset", data).drop_vars(ignore, errors="ignore")
+        yield from _read_dataset(variables, bodies, source, problems)
     elif hasattr(data, "columns") and hasattr(data, "index"):
         yield _table_of_frame(cast("pandas.DataFrame", data), source, problems)
     elif isinstance(data, Mapping):
@@ -67,7 +73,7 @@ def read_tables(data: TableData, bodies: Sequence[str], source: str, problems: l
         problems.append(f"{source}: must be {kinds}, not {type(data).__name__}")
 
 
-def _read_file(path: Path, bodies: Sequence[str], problems: list[str]) -> Iterator[Table]:
+def _read_file(path: Path, bodies: Sequence[str], problems: list[str], ignore: Sequence[str]) -> Iterator[Table]:
     try:
         if path.suffix.lower() == ".csv":
             yield from _read_csv(path, problems)
@@ -75,7 +81,7 @@ def _read_file(path: Path, bodies: Sequence[str], problems: list[str]) -> Iterat
             with OptionalImport():
                 import xarray
             data = xarray.load_dataset(path, decode_times=False)  # without this, xarray converts seconds to durations
-            yield from _read_dataset(data, bodies, str(path), problems, path.stem)
+            yield from _read_dataset(data.drop_vars(ignore, errors="ignore"), bodies, str(path), problems, path.stem)
         else:
             problems.append(f"{path}: must be a .csv or a .nc file")
     except (OSError, ValueError, csv.Error) as error:
@@ -185,6 +191,12 @@ def _read_record(data: "xarray.Dataset", bodies: Sequence[str], source: str, pro
     for key, variable in data.data_vars.items():
         if key in _STATE_CHANNELS and set(variable.dims) == {*dims, "body", "coordinate"}:
             columns |= _state_columns(str(key), variable.transpose(*dims, "body", "coordinate"), bodies, source, problems)
+        elif key == HOLDS and set(variable.dims) == {*dims, "constraint"}:
+            continue
+        elif key == EFFORTS and set(variable.dims) == {*dims, "driver"}:
+            of_drivers = variable.transpose(*dims, "driver")
+            names = map(str, of_drivers["driver"].values)
+            columns |= {f"{EFFORTS}.{name}": TableColumn(of_drivers.values[:, k], None) for k, name in enumerate(names)}
         elif variable.dims in ((), dims):
             columns[str(key)] = TableColumn(np.broadcast_to(variable.values, count), variable.attrs.get("units"))
         else:

@@ -18,7 +18,7 @@ from udkjax.study.identify.problem.unknowns import sample_guesses
 from udkjax.study.identify.search.growing_records import EarlierFits, fit_growing_records
 from udkjax.study.identify.search.least_squares import LOOSE_STEP, SOME_STEPS, CostHistory, Fit
 from udkjax.study.identify.search.optimizer import Minimizer
-from udkjax.study.identify.search.shooting import PieceFailed, fit_pieces
+from udkjax.study.identify.search.shooting import NoFitInPieces, fit_pieces
 
 N_STARTS = 15  # number of further guesses if the first does not lead to a fit
 MOST_GUESSES_IN_PIECES = 4  # number of guesses from which the records are fitted in pieces
@@ -152,7 +152,7 @@ def fit_in_pieces(
     for k, guess in enumerate(rank_guesses(problem, z, loose)[:most] if most else ()):
         try:
             pieces, fit = fit_pieces(problem, guess, loose, minimizer)
-        except PieceFailed:
+        except NoFitInPieces:
             continue
         if explains(pieces, fit, loose):
             result = SearchResult(fit, 1, k + 1, ("records in pieces",), fit.history, pieces)

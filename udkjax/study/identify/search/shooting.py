@@ -69,7 +69,11 @@ class MultipleShooting(FitProblem):
     """
 
     def __init__(self, whole: FitProblem, z: Float[np.ndarray, "K"], tol: TolerancePair, samples: float = RESIDUALS_PER_UNKNOWN):
-        """Cut the records, and compute initial states of all pieces along them from the unknowns z of the whole problem."""
+        """Cut the records, and compute initial states of all pieces along them from the unknowns z of the whole problem.
+
+        Raises:
+            NoFitInPieces: no record can be cut, or a piece cannot be simulated.
+        """
         super().__init__(whole.mechanism, whole.unknowns, whole.records, whole.settings)
         self.predictor = Predictor(whole.mechanism, whole.unknowns.targets, whole.channels, whole.settings, ends=True)
         self.whole, self.weight = whole, GAP_WEIGHTS[0]
@@ -77,10 +81,12 @@ class MultipleShooting(FitProblem):
         free = self._unknowns_at(0, whole.unknowns.guess, first.t0, first.start.state)
         n, self.S = free.basis.shape[1:]
         self.pieces = cut_records(whole, max(samples * self.S, len(whole.index) / MOST_PIECES))
-        times, self.run, self.time = _piece_tables(whole, self.pieces)
         records, N = np.array([piece.record for piece in self.pieces]), len(self.pieces)
         self.beginnings = np.array([p for p, piece in enumerate(self.pieces) if not piece.first])
         self.following = np.setdiff1d(np.arange(N), self.beginnings)
+        if not (self.S and len(self.following)):  # without degrees of freedom, pieces have no unknowns of their own
+            raise NoFitInPieces
+        times, self.run, self.time = _piece_tables(whole, self.pieces)
         self.constrained = len(self.following) * self.S
         self.K, self.extra_rows = whole.K + self.constrained, whole.extra_rows + self.constrained
         self.all_names += tuple(f"piece {p + 1}: {name}" for p in self.following for name in free.names)
@@ -123,7 +129,7 @@ class MultipleShooting(FitProblem):
         measurements.
 
         Raises:
-            PieceFailed: a piece cannot be simulated.
+            NoFitInPieces: a piece cannot be simulated.
         """
         P = len(self.unknowns.names)
         x = self.unknowns.values(z[:P])
@@ -137,7 +143,7 @@ class MultipleShooting(FitProblem):
                 unknowns[columns] = fit.z if np.isfinite(fit.cost) else 0.0
             ends = np.asarray(self._predict_piece(p, x, np.where(columns < 0, 0.0, unknowns[columns])[None], tol).ends)[0]
             if not np.isfinite(ends).all():
-                raise PieceFailed
+                raise NoFitInPieces
             if piece.first:
                 moved.append(self.inverse[p] @ (ends[1] - ends[0]).ravel())
         size = np.sqrt(np.mean(np.square(moved), axis=0)) if moved else np.ones(self.S)
@@ -188,8 +194,12 @@ class MultipleShooting(FitProblem):
         return np.abs(defects.r).max(1, initial=0.0) / self._defect_weight
 
 
-class PieceFailed(Exception):
-    """A piece cannot be simulated with the first guess; the initial state of the next piece is therefore unknown."""
+class NoFitInPieces(Exception):
+    """Records cannot be fitted in pieces.
+
+    They are too short to be cut, or no state of the mechanism is free; or a piece cannot be simulated with the first guess, so
+    that the initial state of the next piece is unknown.
+    """
 
 
 def fit_pieces(
@@ -204,7 +214,7 @@ def fit_pieces(
     Each piece has at least `samples` residuals for each unknown of its initial state.
 
     Raises:
-        PieceFailed: a piece cannot be simulated with the first guess.
+        NoFitInPieces: no record can be cut, or a piece cannot be simulated with the first guess.
     """
     shooting = MultipleShooting(problem, z, tol, samples)
     fit, history = Fit(shooting.guess, np.inf, False, []), []
@@ -224,7 +234,7 @@ def cut_records(problem: FitProblem, least: float) -> tuple[Piece, ...]:
     pieces = []
     for k in range(len(problem.records)):
         numbers = problem.present[k].sum(1)
-        last, first, count = int(np.flatnonzero(numbers)[-1]), 0, 0
+        last, first, count = max(int(np.flatnonzero(numbers)[-1]), 1), 0, 0  # a piece has a duration, also of a single sample
         left = numbers.sum()
         for i in range(1, last):
             count += numbers[i - 1]
