@@ -22,7 +22,7 @@ from udkjax.pinv.row_spaces import echelon, null_space
 from udkjax.study.identify.problem.residuals import ReducedGroups, Reduction
 from udkjax.study.identify.problem.unknowns import INVISIBLE_RATIO
 from udkjax.study.noise import SIGNIFICANCE
-from udkjax.wording import join_names
+from udkjax.wording import join_names, plural
 
 POOR_ERROR = 0.5  # standard error reported as large, relative to the value or to the scale of a parameter of either sign
 HIGH_CORRELATION = 0.98  # at this correlation, one combination of two parameters is ten times less accurate than the other one
@@ -265,10 +265,8 @@ def _sentences(result: Uncertainty) -> Iterator[str]:
         cure = "fix one of them, give one a prior, or measure more" if len(flat.names) > 1 else "fix it, or measure more"
         yield f"no measured quantity changes with {flat.text}: {cure}"
     if not np.isfinite(result.noise).all():
-        yield (
-            f"{result.rows} residuals are too few to estimate the noise, and standard errors are unknown: give "
-            "the noise, or more data"
-        )
+        few = f"{plural(result.rows, 'residual')} {'is' if result.rows == 1 else 'are'} too few"
+        yield f"{few} to estimate the noise, and standard errors are unknown: give the noise, or more data"
     for name in result.poor:
         k = list(values.names).index(name)
         error, unit = result.standard_errors[k], f" {values.units[k]}".rstrip()
