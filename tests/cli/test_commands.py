@@ -133,10 +133,10 @@ def test_all_mistakes_of_a_scene_are_named_and_nothing_is_written(tmp_path, caps
         ([PARALLELOGRAM, "--t1", "1", "--dt", "2"], "--dt 2"),
         ([PARALLELOGRAM, "--t1", "1", "--dt", "1e-12"], "--dt 1e-12 makes 1e+12 output times"),
         ([PARALLELOGRAM, "--t1", "1", "--rtol", "-1"], "rtol must be zero or positive and finite, not -1"),
-        ([PARALLELOGRAM, "--t1", "1", "--atol", "nan"], "atol must be"),
+        ([PARALLELOGRAM, "--t1", "1", "--atol", "nan"], "--atol nan: must be finite"),
         ([PARALLELOGRAM, "--t1", "1", "--rtol", "1e-30", "--atol", "0"], "are below rounding"),
         ([PARALLELOGRAM, "--t1", "1", "--rank-tol", "-1"], "method.rank_tol must be"),
-        ([PARALLELOGRAM, "--t1", "1", "--max-steps", "0"], "max_steps must be at least 1, not 0"),
+        ([PARALLELOGRAM, "--t1", "1", "--max-steps", "0"], "--max-steps must be at least 1, not 0"),
         (
             [PARALLELOGRAM, "--t1", "1", "--formulation", "partitioning", "--stabilization", "baumgarte"],
             "keeps the constraints itself",

@@ -16,8 +16,10 @@ A command is a function of its options that imports what it needs when it runs:
         result = compute(mech)
         show({"frequencies": result.frequencies}, table(mech.name, {...}), json)
 
-Wrong input ends with `refuse("--count 0: must be positive")`, a failed run with `fail(...)` after `show(...)`. Exceptions of
-udkjax (`SceneError`, `SimulationError`, ...) need no handling: see `exits.exit_codes`.
+Numbers of options are finite, and within the limits of their types (`PositiveCount`, see `options`). Other wrong input ends with
+`refuse("--count 0: must be positive")`, options that have no effect with `refuse_without_effect(...)`, a failed run with
+`fail(...)` after `show(...)`. Exceptions of udkjax (`SceneError`, `SimulationError`, ...) need no handling: see
+`exits.exit_codes`.
 """
 
 import json as json_text
@@ -29,6 +31,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from udkjax.cli.exits import BAD_INPUT, BAD_RUN, INTERRUPTED, fail, refuse, say
+from udkjax.cli.options import with_checked_options
 from udkjax.extras import OptionalImport
 
 with OptionalImport():
@@ -53,8 +56,12 @@ Quiet = Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(help="do not
 
 def parse_and_run(commands: Mapping[str, Callable[..., None]], arguments: list[str] | None) -> None:
     """Parse arguments (by default those of the process), and run the command that they name."""
+    words = sys.argv[1:] if arguments is None else arguments
     tyro.extras.subcommand_cli_from_dict(
-        dict(commands), prog="udkjax", args=arguments, description="Planar mechanisms, even with redundant constraints."
+        {name: with_checked_options(command, words) for name, command in commands.items()},
+        prog="udkjax",
+        args=arguments,
+        description="Planar mechanisms, even with redundant constraints.",
     )
 
 

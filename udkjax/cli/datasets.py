@@ -40,12 +40,12 @@ def load_to_write(scene: Path, out: Path | None, plot: Path | None = None) -> tu
     return load(scene)
 
 
-def check_folder(out: Path) -> None:
+def check_folder(out: Path, option: str = "--out") -> None:
     """Exit with a message if a folder to write cannot be created, or is named like a file."""
     if out.exists() and not out.is_dir():
-        refuse(f"--out {out} is not a folder")
+        refuse(f"{option} {out} is not a folder")
     if not out.exists() and out.suffix.lower() in FILE_SUFFIXES:
-        refuse(f"--out {out}: a folder with several files is written; give a name without {out.suffix}")
+        refuse(f"{option} {out}: a folder with several files is written; give a name without {out.suffix}")
     if not out.parent.is_dir():
         refuse(f"cannot create {out.name}: there is no folder {out.parent}")
 

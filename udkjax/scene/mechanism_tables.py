@@ -1,5 +1,6 @@
 """Convert mechanisms to the tables of a TOML file, format 1, and back, with bitwise identical numbers."""
 
+import math
 import re
 import tomllib
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -17,6 +18,7 @@ from udkjax.scene.tables.element_setup import name_elements
 from udkjax.scene.tables.schema import CLASSES_BY_TYPE, CLASSES_WITHOUT_TYPE, SECTIONS, build, is_in_format, table_of, type_name
 from udkjax.wording import abbreviate, unknown_key
 
+LARGEST_INTEGER = 2**1023  # of a file; larger ones are beyond the range of floats
 FORMAT_VERSION = 1  # version of the format of scenes with bodies and joints
 
 
@@ -160,11 +162,21 @@ def parse_toml(text: str, source: str, error: type[Mistakes]) -> dict[str, Any]:
         line = text.count("\n", 0, key.start()) + 1
         raise error([f"line {line}: a key with more than {MOST_KEY_PARTS} parts between dots; three are enough"], source)
     try:
-        return tomllib.loads(text.removeprefix("\ufeff"))
+        return _without_huge_integers(tomllib.loads(text.removeprefix("\ufeff")))
     except RecursionError:
         raise error(["not valid here: lists or tables nest too deeply to be read; three levels are enough"], source) from None
     except ValueError as problem:  # not TOML, or an integer with more digits than Python reads
         raise error([f"not valid TOML: {problem}"], source) from None
+
+
+def _without_huge_integers(value: Any) -> Any:
+    """Return tables with integers beyond the range of floats as infinite numbers, as TOML reads 1e400, to be refused as these."""
+    if isinstance(value, dict):
+        return {key: _without_huge_integers(x) for key, x in value.items()}
+    if isinstance(value, list):
+        return [_without_huge_integers(x) for x in value]
+    is_huge = isinstance(value, int) and abs(value) > LARGEST_INTEGER
+    return math.copysign(math.inf, value > 0 or -1) if is_huge else value
 
 
 def is_xml(text: str) -> bool:

@@ -153,7 +153,7 @@ def test_a_curve_is_drawn_by_mechanisms_shown_and_written(tmp_path, capsys):
         (("--curve", "curve.csv", "--unit", "parsec"), "--unit parsec"),
         (("--curve", "absent.csv"), "cannot read absent.csv"),
         (("--curve", "curve.csv", "--bars", 3), "--bars must be at least 4"),
-        (("--curve", "curve.csv", "--seconds", "nan"), "--seconds must be"),
+        (("--curve", "curve.csv", "--seconds", "nan"), "--seconds nan: must be finite"),
         (("--curve", "curve.csv", "--out", "curve.csv"), "cannot write --out curve.csv"),
         (("--curve", "curve.csv", "--size", 1), "--size must be more than"),
         (("--curve", "point.csv"), "coincide"),

@@ -297,7 +297,7 @@ def test_all_mistakes_at_once_and_none_twice():
     assert problems(text) == [
         'ground[1]: no pin named "c"; did you mean "C"?',
         'pins.A[0]: "kg" does not fit; it is measured in m, mm, cm',
-        'link "rod" (link[1]).width: must be >= 0, not -0.001',
+        'link "rod" (link[1]).width: must be >= 0, not -1',
     ]
 
 

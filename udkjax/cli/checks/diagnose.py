@@ -1,6 +1,7 @@
 """`udkjax diagnose`."""
 
 from udkjax.cli.common import Json, Scene, fail, load, output_times, show
+from udkjax.cli.options import refuse_without_effect
 
 
 def diagnose(
@@ -17,6 +18,8 @@ def diagnose(
         dt: time between outputs of the run (s); rank changes are also found between outputs.
         fixes: search for changes of joints that remove redundancy, and verify them.
     """
+    if t1 is None:
+        refuse_without_effect(["--dt"], "without a run: give its end, --t1")
     ts = None if t1 is None else output_times(t, t1, dt)
     mech, _ = load(scene)
 

@@ -5,6 +5,7 @@ from typing import Any, Literal
 
 from udkjax.cli.common import Json, Scene, load, output_times, refuse, show
 from udkjax.cli.datasets import check_folder
+from udkjax.cli.options import refuse_without_effect
 
 What = Literal[
     "run", "step_derivatives", "accelerations", "derivatives", "projection", "positions", "position_derivatives", "reactions"
@@ -56,13 +57,15 @@ def export(
         refuse("give --c FOLDER for C99, or --fmu FILE for an FMU")
     ts = output_times(t0, t1, dt)
     if fmu is not None:
+        refuse_without_effect(["--what"], "with --fmu: it names functions of --c")
         if fmu.suffix != ".fmu" or not fmu.parent.is_dir() or fmu.is_dir():
             refuse(f"--fmu {fmu}: give the name of a file that ends in .fmu, in a folder that exists")
         mech, _ = load(scene)
         _fmu(mech, fmu, (kinds, parameters, inputs, outputs, t0, t1, dt, rtol, atol, stiff, platforms), json)
         return
     assert c is not None
-    check_folder(c)
+    refuse_without_effect(["--kinds", "--inputs", "--outputs", "--platforms"], "with --c: it is for an FMU, --fmu")
+    check_folder(c, "--c")
     if not what:
         refuse("--what: name at least one function")
     mech, _ = load(scene)

@@ -2,16 +2,17 @@
 
 from pathlib import Path
 
-from udkjax.cli.common import Json, Scene, fail, refuse, show
+from udkjax.cli.common import Json, Scene, fail, show
 from udkjax.cli.datasets import load_to_write, write
+from udkjax.cli.options import NotNegativeCount, PositiveCount, refuse_without_effect
 
 
 def statics(
     scene: Scene,
     /,
     stable: bool = False,
-    starts: int = 1,
-    seed: int = 0,
+    starts: PositiveCount = 1,
+    seed: NotNegativeCount = 0,
     t: float = 0.0,
     out: Path | None = None,
     json: Json = False,
@@ -28,8 +29,8 @@ def statics(
         out: file to write (.nc, .h5, .csv or .npz): q (equilibrium, body, coordinate), omega2 (equilibrium, mode), multiplier
             (equilibrium, row), and the holding torques and forces of drivers and the forces at pins (equilibrium).
     """
-    if starts < 1:
-        refuse(f"--starts {starts}: must be positive")
+    if starts == 1:
+        refuse_without_effect(["--seed"], "with one start: give --starts")
     mech, text = load_to_write(scene, out)
     import numpy as np
 

@@ -9,6 +9,7 @@ import tyro
 
 from udkjax.cli.common import Json, fail, is_of_library, load, output_times, refuse, show
 from udkjax.cli.datasets import check_target
+from udkjax.cli.options import Positive, PositiveCount, in_option_words, refuse_without_effect
 from udkjax.extras import NETCDF_PACKAGES, WRITING_PACKAGES, require
 
 if TYPE_CHECKING:
@@ -20,6 +21,16 @@ if TYPE_CHECKING:
     ShownRun = tuple[Mechanism, ShownMotion, dict[str, np.ndarray]]  # the last entry: further measures by name
 
 ANIMATION_SUFFIXES = (".html", ".gif", ".mp4", ".svg", ".png", ".dxf")
+PICTURES, FILMS = (".svg", ".png"), (".gif", ".mp4")
+KINDS_OF_OPTION = {  # kinds of files on which an option has an effect
+    "--measures": (".html",),
+    "--autoplay": (".html",),
+    "--theme": (".html", *FILMS, *PICTURES),
+    "--t": (*PICTURES, ".dxf"),
+    "--fps": FILMS,
+    "--speed": FILMS,
+    "--width": (*FILMS, *PICTURES),
+}
 Files = Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN.nc|SCENE.toml|NAME")]
 
 
@@ -38,9 +49,9 @@ def animate(
     theme: Literal["light", "dark"] | None = None,
     autoplay: bool = False,
     t: float | None = None,
-    fps: float | None = None,
-    speed: float | None = None,
-    width: int | None = None,
+    fps: Positive | None = None,
+    speed: Positive | None = None,
+    width: PositiveCount | None = None,
     json: Json = False,
 ) -> None:
     """Show one or several synchronized motions as a page for the browser, a film or a picture.
@@ -69,6 +80,11 @@ def animate(
     """
     check_target(out, ANIMATION_SUFFIXES)
     kind = out.suffix.lower()
+    for option, kinds in KINDS_OF_OPTION.items():
+        if kind not in kinds:
+            refuse_without_effect([option], f"on --out {out.name}: it is for {', '.join(kinds)}")
+    if not any(map(_is_scene, files)):
+        refuse_without_effect(["--t1", "--dt"], "on runs that are read: it is for scenes")
     require(
         *WRITING_PACKAGES.get(kind, ()),
         *(NETCDF_PACKAGES if any(file.suffix.lower() in (".nc", ".h5") for file in files) else ()),
@@ -91,10 +107,8 @@ def animate(
     from udkjax.show.player.animation import FailedRunWarning
 
     runs = {name: _run(file, t1, dt) for name, file in zip(names, files, strict=True)}
-    film = {"fps": fps, "speed": speed} if kind in (".gif", ".mp4") else {}
-    page = {"autoplay": autoplay} if kind == ".html" else {} if kind == ".dxf" else {"width": width}
-    look = {"theme": theme} if kind != ".dxf" else {}
-    options = {name: value for name, value in (film | page | look).items() if value is not None}
+    look = {"theme": theme, "fps": fps, "speed": speed, "width": width, "autoplay": autoplay or None}
+    options = {name: value for name, value in look.items() if value is not None}
     try:
         with warnings.catch_warnings(action="ignore", category=FailedRunWarning):  # reported below
             animation = udk.animate(
@@ -108,7 +122,7 @@ def animate(
             )
         animation.save(out, t, **options)
     except (ValueError, OSError) as problem:
-        refuse(problem)
+        refuse(in_option_words(str(problem), animate))
     size = out.stat().st_size
     data = animation.data
     results = {"files": [out], "bytes": size, "start": data["start"], "end": data["end"], "speed": data["speed"]}
@@ -117,12 +131,17 @@ def animate(
         fail("; ".join(f"{name}: {cause}" if name else f"the run failed: {cause}" for name, cause in animation.failures.items()))
 
 
+def _is_scene(file: Path) -> bool:
+    """Return True for a scene, which is simulated, and False for a run."""
+    return file.suffix.lower() in (".toml", ".xml") or is_of_library(file) or not (file.suffix or file.exists())
+
+
 def _run(file: Path, t1: float, dt: float) -> "ShownRun":
     """Return the mechanism of a file, its run, and further measures that the file contains, by "name (unit)".
 
     A scene is simulated until `t1` with an output time each `dt`, and has no further measures.
     """
-    if file.suffix.lower() in (".toml", ".xml") or is_of_library(file) or not (file.suffix or file.exists()):
+    if _is_scene(file):
         mechanism, _ = load(file)
 
         import udkjax as udk

@@ -1,5 +1,6 @@
 """`udkjax gaps`."""
 
+import math
 from typing import Annotated
 
 from udkjax.cli.common import Json, Scene, choose_driver, fail, show
@@ -47,6 +48,8 @@ def gaps(
     given = None if width is None else counted.units.convert("--width", width, "m", problems)
     if problems:
         refuse(problems[0])
+    if isinstance(given, float) and not 0 <= given < math.inf:
+        refuse(f"--width {width}: must be finite and not negative")
     shapes = None if given is None else dict.fromkeys(mech.body_names, given)
     found = udk.gaps(mech, driver, values=values, shapes=shapes)
     results = {

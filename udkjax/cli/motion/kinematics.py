@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from udkjax.cli.common import Json, Scene, channels_of, choose_driver, fail, measure_channels, refuse, show
 from udkjax.cli.datasets import load_to_write, write
+from udkjax.cli.options import PositiveCount
 from udkjax.extras import OptionalImport
 
 if TYPE_CHECKING:
@@ -25,7 +26,7 @@ def kinematics(
     at: str | None = None,
     first: Annotated[str | None, tyro.conf.arg(name="from")] = None,
     last: Annotated[str | None, tyro.conf.arg(name="to")] = None,
-    count: int | None = None,
+    count: PositiveCount | None = None,
     rate: str | None = None,
     branches: bool = False,
     channels: tuple[str, ...] = (),
@@ -54,8 +55,6 @@ def kinematics(
         out: file to write (.nc, .h5, .csv or .npz): value, q, v and a (value, body, coordinate), status.
         plot: picture to write (.png, .svg, .pdf or .jpg): poses and angles, or the channels.
     """
-    if count is not None and count < 1:
-        refuse(f"--count {count}: must be positive")
     if at is not None and (first, last, count) != (None, None, None):
         refuse("--at is one value: leave out --from, --to and --count")
     mech, text = load_to_write(scene, out, plot)

@@ -10,6 +10,7 @@ from typing import Any, Literal
 
 from udkjax.cli.common import Json, Scene, channels_of, fail, load, measure_channels, output_times, refuse, show
 from udkjax.cli.datasets import PICTURE_SUFFIXES, check_target, save
+from udkjax.cli.options import refuse_without_effect
 from udkjax.extras import NETCDF_PACKAGES, require
 
 # The names in udkjax.study.choices, which cannot be imported here, since it imports JAX.
@@ -52,19 +53,25 @@ def simulate(
         t0: start of the run (s).
         rtol: relative tolerance of a step.
         atol: absolute tolerance of a step, in units of the scene's characteristic length and time (printed by `udkjax check`).
-        method: pseudoinverse of the weighted constraint Jacobian.
+        method: pseudoinverse of the weighted constraint Jacobian; formulations other than udwadia-kalaba use it only for
+            projection.
         rank_tol: relative threshold of the rank; by default, one that suits the method.
         formulation: formulation of the accelerations; partitioning integrates independent coordinates only, without Baumgarte.
         solver: integrator; verner65, adams and bdf are part of udkjax, the others of diffrax.
         stabilization: projection of each step onto the constraints, Baumgarte's terms, or none.
-        alpha: Baumgarte's gain on the rate of the constraints (1/s).
-        beta: Baumgarte's gain on the constraints (1/s).
+        alpha: Baumgarte's gain on the rate of the constraints (1/s), with --stabilization baumgarte.
+        beta: Baumgarte's gain on the constraints (1/s), with --stabilization baumgarte.
         dt0: first step to try (s); by default it is estimated.
         max_steps: maximum number of steps, after which the run fails.
         channels: further channels to write, such as pin.C.x, joint.A.fx or driver.motor.load, and to draw in a separate picture.
         plot: picture to write (.png, .svg, .pdf or .jpg); by default a .png with the name of the file.
     """
     ts = output_times(t0, t1, dt)
+    if stabilization != "baumgarte":
+        refuse_without_effect(["--alpha", "--beta"], f"with --stabilization {stabilization}: use --stabilization baumgarte")
+    if formulation != "udwadia-kalaba" and stabilization != "projection":
+        both = f"--formulation {formulation} and --stabilization {stabilization}"
+        refuse_without_effect(["--method", "--rank-tol"], f"with {both}, which use no pseudoinverse")
     check_target(out)
     plot = plot or out.with_suffix(".png")
     if dt0 is not None and not 0 < dt0 < math.inf:

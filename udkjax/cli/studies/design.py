@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 from udkjax.cli.common import Json, fail, refuse, show
 from udkjax.cli.exits import NO_FIT
+from udkjax.cli.options import NotNegative, NotNegativeCount, Positive, PositiveCount, refuse_without_effect
 from udkjax.extras import OptionalImport
 
 with OptionalImport():
@@ -15,20 +16,21 @@ with OptionalImport():
 Goal = Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="GOAL.toml")]
 
 TURN_INSTANTS = 241  # of a turn on a page
+OF_CURVES = "--bars", "--size", "--seconds", "--geared", "--slides", "--unit"  # options
 NOT_A_FIT = 0.1  # error of a mechanism, in RMS radii of its curve, beyond which it draws another curve
 
 
 def design(
     goal: Goal = None,
     /,
-    starts: int = 300,
-    seed: int = 0,
-    results: int = 5,
+    starts: PositiveCount = 300,
+    seed: NotNegativeCount = 0,
+    results: PositiveCount = 5,
     out: Path | None = None,
     curve: Path | None = None,
-    bars: int = 12,
-    size: float | None = None,
-    seconds: float = 60.0,
+    bars: PositiveCount = 12,
+    size: Positive | None = None,
+    seconds: NotNegative = 60.0,
     geared: bool = True,
     slides: bool = False,
     unit: str = "mm",
@@ -40,7 +42,7 @@ def design(
     tenth of their extent, or a curve by more than a tenth of its RMS radius.
 
     The loss of a design is the weighted sum of squares of its residuals, the distances from the goal. With `complete = true` in
-    the file, all four-bars through nine points, or five poses, are found, and --starts and --seed are ignored.
+    the file, all four-bars through nine points, or five poses, are found, without --starts and --seed.
 
     With --curve no drawing is needed: structure and dimensions of linkages with one motor are found. Ctrl-C ends this search with
     the best designs so far.
@@ -59,9 +61,10 @@ def design(
         slides: whether a third of their dyads has a slide or a rail in the place of a pin.
         unit: unit of the curve and of the drawings.
     """
-    for name, value, minimum in (("starts", starts, 1), ("results", results, 1), ("seed", seed, 0)):
-        if value < minimum:
-            refuse(f"--{name} {value}: must be at least {minimum}")
+    if curve is None:
+        refuse_without_effect(OF_CURVES, "without --curve")
+    elif goal is None:
+        refuse_without_effect(["--starts"], "with --curve: its search ends after --seconds")
     if out is not None:
         try:
             out.mkdir(parents=True, exist_ok=True)
@@ -83,6 +86,7 @@ def design(
     except (OSError, UnicodeDecodeError) as problem:
         refuse(f"cannot read {goal}: {problem}")
     if isinstance(search, CompleteSearch):
+        refuse_without_effect(["--starts", "--seed"], f"with complete = true in {goal}, which finds all four-bars")
         _show_all(goal, search, results, out, json)
         return
     designs = search(starts, seed, results)

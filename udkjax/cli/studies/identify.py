@@ -82,8 +82,9 @@ def identify(
             interrupted command continues from the draws that are there.
         json: write the results as JSON, as in estimate.json.
     """
-    for folder in filter(None, (out, posterior)):
-        check_folder(folder)
+    check_folder(out)
+    if posterior is not None:
+        check_folder(posterior, "--posterior")
     require(*NETCDF_PACKAGES, "matplotlib", *(BAYES_PACKAGES if posterior else ()))
     mech, text = load(scene)
 

@@ -9,6 +9,7 @@ from typing import Annotated
 import tyro
 
 from udkjax.cli.common import Json, Quiet, refuse, show
+from udkjax.cli.options import NotNegativeCount, refuse_without_effect
 
 # Variables of each run in the JSON.
 RUN_VARIABLES = (
@@ -30,7 +31,7 @@ def report(
     out: Path = Path("report"),
     quick: bool = False,
     start: float = -45.0,
-    seed: int = 0,
+    seed: NotNegativeCount = 0,
     from_file: Annotated[Path | None, tyro.conf.arg(name="from", metavar="FILE.nc")] = None,
     quiet: Quiet = False,
     json: Json = False,
@@ -48,8 +49,8 @@ def report(
         from_file: file of an earlier report: only draw the page from it, without running anything.
     """
     target = out if out.suffix == ".html" else out / "report.html"
-    if seed < 0:
-        refuse(f"--seed {seed} must not be negative")
+    if from_file is not None:
+        refuse_without_effect(["--quick", "--start", "--seed"], "with --from, which runs nothing")
     if out.suffix not in ("", ".html"):
         refuse(f"--out {out} is neither a page (.html) nor a folder")
     folder = target.parent if out.suffix else out.parent

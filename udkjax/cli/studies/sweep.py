@@ -11,6 +11,7 @@ import tyro
 
 from udkjax.cli.common import INTERRUPTED, Json, Quiet, Scene, load, refuse, say, show
 from udkjax.cli.datasets import check_folder
+from udkjax.cli.options import Positive
 from udkjax.extras import NETCDF_PACKAGES, require
 
 if TYPE_CHECKING:
@@ -26,7 +27,7 @@ def sweep(
     out: Path | None = None,
     engine: Literal["auto", "devices", "dask"] = "auto",
     scheduler: str | None = None,
-    memory: float = 1024.0,
+    memory: Positive = 1024.0,
     dry_run: bool = False,
     quiet: Quiet = False,
     json: Json = False,
@@ -50,8 +51,6 @@ def sweep(
         refuse("give --out FOLDER, or --dry-run")
     if out is not None:
         check_folder(out)
-    if not memory > 0:
-        refuse(f"--memory {memory:g}: must be positive")
     if scheduler is not None and engine == "devices":
         refuse("--scheduler needs --engine dask")
     require(*NETCDF_PACKAGES, "matplotlib", *(("dask", "distributed") if engine == "dask" else ()))

@@ -5,7 +5,9 @@ from pathlib import Path
 from typing import Annotated
 
 from udkjax.cli.common import Json, Quiet, Scene, choose_driver, load, refuse, show
-from udkjax.extras import OptionalImport
+from udkjax.cli.datasets import PICTURE_SUFFIXES, check_target
+from udkjax.cli.options import NotNegativeCount, PositiveCount, refuse_without_effect
+from udkjax.extras import OptionalImport, require
 
 with OptionalImport():
     import tyro
@@ -20,9 +22,9 @@ def tolerances(
     driver: str | None = None,
     first: Annotated[str | None, tyro.conf.arg(name="from")] = None,
     last: Annotated[str | None, tyro.conf.arg(name="to")] = None,
-    count: int = 72,
-    samples: int = 100_000,
-    seed: int = 0,
+    count: PositiveCount = 72,
+    samples: NotNegativeCount = 100_000,
+    seed: NotNegativeCount = 0,
     cheapest: float | None = None,
     plot: Path | None = None,
     json: Json = False,
@@ -41,7 +43,7 @@ def tolerances(
         first: first value of the driver, such as "60 deg", counted as by `udkjax kinematics`; by default, every 5 degrees of a
             turn from the drawn position.
         last: last value.
-        count: number of values.
+        count: number of values, with --from and --to.
         samples: number of samples.
         seed: seed of the samples.
         cheapest: also find the tolerances of least cost with this yield, such as 0.99.
@@ -49,8 +51,14 @@ def tolerances(
     """
     if (first is None) != (last is None):
         refuse("give both --from and --to, or neither")
-    if count < 1:
-        refuse(f"--count {count}: must be positive")
+    if first is None:
+        refuse_without_effect(["--count"], "without a range: give --from and --to")
+    if cheapest is not None and not limit:
+        refuse(f"--cheapest {cheapest:g}: a yield needs limits; give --limit")
+    if cheapest is not None and not 0 < cheapest < 1:
+        refuse(f"--cheapest {cheapest:g}: must be between 0 and 1")
+    check_target(plot, PICTURE_SUFFIXES, "--plot")
+    require(*(["matplotlib"] if plot else ()))
     mech, _ = load(scene)
     import numpy as np
 
@@ -77,7 +85,10 @@ def tolerances(
     }  # fmt: skip
     text = str(found)
     if cheapest is not None:
-        best = results["cheapest"] = found.cheapest(cheapest)
+        try:
+            best = results["cheapest"] = found.cheapest(cheapest)
+        except ValueError as problem:
+            refuse(f"--cheapest {cheapest:g}: {problem}")
         text += f"\n{best}"
     if plot is not None:
         from udkjax.show.figures import tolerances_figure

@@ -4,6 +4,7 @@ import csv
 from pathlib import Path
 
 from udkjax.cli.common import Json, Scene, load, refuse, show
+from udkjax.cli.options import NotNegativeCount, PositiveCount, refuse_without_effect
 
 MOST_STUDENTS = 2000
 
@@ -14,9 +15,9 @@ def exercise(
     vary: tuple[str, ...],
     out: Path,
     at: str = "40 deg",
-    count: int | None = None,
+    count: PositiveCount | None = None,
     students: Path | None = None,
-    seed: int = 0,
+    seed: NotNegativeCount = 0,
     json: Json = False,
 ) -> None:
     """Write an exercise for each student with numbers of their own, its solution, and a table of all answers.
@@ -34,13 +35,13 @@ def exercise(
     """
     if (count is None) == (students is None):
         refuse("give --count or --students")
-    if seed < 0:
-        refuse(f"--seed {seed}: must not be negative")
+    if any(text.split()[:1] == ["at"] for text in vary):
+        refuse_without_effect(["--at"], "if --vary has a range of it")
     names = _names(students) if students is not None else [f"student {k + 1}" for k in range(count or 0)]
     if not 0 < len(names) <= MOST_STUDENTS:
         refuse(f"{len(names)} students: must be from 1 to {MOST_STUDENTS}")
     if out.exists() and not out.is_dir():
-        refuse(f"--out {out}: is not a folder")
+        refuse(f"--out {out} is not a folder")
     mech, _ = load(scene)
     from udkjax.study.worked.exercises import write_course
 

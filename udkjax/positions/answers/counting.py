@@ -14,6 +14,7 @@ from udkjax.scene.drawing.drawn_quantities import Units
 from udkjax.scene.elements.bodies import GROUND
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.tables.checks import SceneError
+from udkjax.wording import abbreviate
 
 DRAWN_TOL = 1e-10  # relative to the largest: smaller is rounding of a drawing's numbers, which editors write with twelve digits
 
@@ -95,7 +96,7 @@ class Count(NamedTuple):
         """Return the driver's value (rad, m) for a shown number: a number in the unit of the drawing, or a text with its unit.
 
         Raises:
-            SceneError: it is not a number, or the unit does not fit; the message begins with `name`.
+            SceneError: it is not a finite number, or the unit does not fit; the message begins with `name`.
         """
         return self._number(given, "rad" if self.is_angle else "m", name) - self.offset
 
@@ -121,6 +122,8 @@ class Count(NamedTuple):
         found = self.units.convert(name, given, unit, problems)
         if problems or not isinstance(found, int | float | np.number):
             raise SceneError(problems or [f"{name}: must be a number, or a text with a number and its unit"])
+        if not math.isfinite(found):
+            raise SceneError([f"{name}: must be finite, not {abbreviate(given)}"])
         return float(found)
 
 

@@ -1,7 +1,7 @@
 """Read the elements of a drawing from tables, and find all mistakes: in units, keys, names, connections and geometry."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -145,10 +145,12 @@ def _read_element(
         return
     failed: list[str] = []
     table, cls, count = entry.table, entry.cls, len(units.expressions)
+    written: TomlTable = {}
     if not isinstance(entry.element, cls):
         variant, law = units_of_element(cls, table)
         table = units.convert_table(path, cls, table, failed, variant, law)
-    mistakes = [*failed, *without_failed(check_table(path, cls, table, known), failed)]
+        written = _as_written(path, entry.table, table, {x.path for x in units.expressions[count:]})
+    mistakes = [*failed, *without_failed(check_table(path, cls, table, known, written), failed)]
     if entry.section == "pin":
         mistakes = [problem.replace(f"{path}.position", path, 1) for problem in mistakes]
     problems += mistakes
@@ -162,6 +164,22 @@ def _read_element(
                 problems.append(f"{expression.path}: {ONLY_PLAIN} {quote(expression.text)}")
             else:
                 formulas.append(formula)
+
+
+def _as_written(path: str, given: Any, converted: Any, expressions: Collection[str]) -> Any:
+    """Return a value of a table as it was given, but with the numbers that expressions give, in SI units, in place of these.
+
+    Args:
+        path: The path of the value.
+        given: The value.
+        converted: The value in SI units.
+        expressions: The paths of the expressions.
+    """
+    if isinstance(given, Mapping) and isinstance(converted, Mapping):
+        return {key: _as_written(f"{path}.{key}", x, converted.get(key), expressions) for key, x in given.items()}
+    if isinstance(given, list | tuple) and isinstance(converted, list | tuple) and len(given) == len(converted):
+        return [_as_written(f"{path}[{k}]", x, y, expressions) for k, (x, y) in enumerate(zip(given, converted, strict=True))]
+    return converted if path in expressions else given
 
 
 def _formula(entry: SceneEntry, built: Any, expression: Expression, path: str) -> Formula | None:

@@ -245,7 +245,9 @@ def _shape_mistakes(places: Mapping[str, PointArray], link: Link) -> Iterator[st
         elif key == "outline" and not any(_reaches(corners, point) for point in points):
             yield f".outline: crosses none of the pins {', '.join(map(quote, link.pins))}"
         for k, hole in enumerate([] if link.holes is None else np.asarray(link.holes)):
-            if not _reaches(corners, hole[0]):
+            if abs(twice_area(hole)) <= SAME_PLACE_TOL * extent(list(corners)) ** 2:
+                yield f".holes[{k}]: the corners lie on one line, and enclose no area"
+            elif not _reaches(corners, hole[0]):
                 yield f".holes[{k}]: lies outside of the outline"
 
 

@@ -36,6 +36,8 @@ def direction(value: Numbers | None) -> Float[Array, ""]:
         return array
     xp = np if not isinstance(array, Tracer) else jnp
     x, y = xp.asarray(array)
+    if not isinstance(array, Tracer) and not np.isfinite(x + y):
+        return number(x + y)  # refused as an angle that is not finite
     return number(xp.arctan2(y, x))
 
 
@@ -56,7 +58,10 @@ def or_as_given(convert: Callable[[Any], Any]) -> Callable[[Any], Any]:
 
 
 def vector_as_angle(value: Any) -> Any:
-    """Return the angle (rad) of a vector of two numbers in a table; return anything else unchanged, to be refused later."""
+    """Return the angle (rad) of a vector of two numbers in a table; return anything else unchanged, to be refused later.
+
+    Of a vector with numbers that are not finite, one of these is returned.
+    """
     components = list(value) if isinstance(value, np.ndarray | jax.Array) and value.shape == (2,) else value
     numbers = int | float | np.number | jax.Array
     if not isinstance(components, list | tuple) or len(components) != 2 or not all(isinstance(x, numbers) for x in components):
@@ -65,7 +70,13 @@ def vector_as_angle(value: Any) -> Any:
         return value
     if is_traced(components):
         return direction(components)
-    return math.atan2(components[1], components[0]) if any(components) else value
+    try:
+        x, y = map(float, components)
+    except OverflowError:  # an integer beyond the range of floats
+        return value
+    if infinite := [c for c in (x, y) if not math.isfinite(c)]:
+        return infinite[0]  # refused as an angle that is not finite
+    return math.atan2(y, x) if x or y else value
 
 
 def names(value: Sequence[str] | str) -> tuple[str, ...]:
@@ -116,11 +127,13 @@ class Requirement(NamedTuple):
 
     Numbers that violate a `strict` requirement are meaningless; if traced numbers violate it, the run ends with
     `Result.invalid_argument`. Other numbers, such as a negative damping, are valid: finite differences around zero need them.
+    `shown_sum` returns the sum of all entries as text, if the requirement is one on their sum; None for one on each entry.
     """
 
     text: str
     holds: Callable[[Any], Any]
     strict: bool = True
+    shown_sum: Callable[[float], str] | None = None
 
 
 class FieldMetadata(TypedDict, total=False):
@@ -132,6 +145,14 @@ class FieldMetadata(TypedDict, total=False):
     names: Literal["body", "rubbing", "pin", "link", "slide", "slot"]  # kind of the names that the field holds
 
 
+def _shown_angle(angle: float) -> str:
+    return f"{math.degrees(angle):.12g} deg ({angle:.12g} rad)"
+
+
+def _shown_length(length: float) -> str:
+    return f"{length:.12g} m"
+
+
 CLOSING_TOL = 1e-9  # relative to the sum of the sizes: numbers of a file have more digits
 
 _POSITIVE = Requirement("must be > 0", lambda v: v > 0)
@@ -141,12 +162,15 @@ _ONE_TURN = Requirement("must be less than a turn after the first (the profile c
 _WHOLE_TURN = Requirement(
     "the angles must add up to a whole turn",
     lambda v: abs(v.sum() - 2 * np.pi) * array_namespace(v).ones_like(v) <= CLOSING_TOL * 2 * np.pi,
+    shown_sum=_shown_angle,
 )
 _LIFTS_RETURN, _SWINGS_RETURN = (
     Requirement(
-        f"the {steps} must add up to zero", lambda v: abs(v.sum()) * array_namespace(v).ones_like(v) <= CLOSING_TOL * abs(v).sum()
+        f"the {steps} must add up to zero",
+        lambda v: abs(v.sum()) * array_namespace(v).ones_like(v) <= CLOSING_TOL * abs(v).sum(),
+        shown_sum=shown_sum,
     )
-    for steps in ("lifts", "swings")
+    for steps, shown_sum in (("lifts", _shown_length), ("swings", _shown_angle))
 )
 
 POSITIVE: FieldMetadata = {"require": (_POSITIVE,)}

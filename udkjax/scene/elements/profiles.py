@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from udkjax.annotations import Number
+from udkjax.arrays import is_array
 from udkjax.printing import PrintsLine
 from udkjax.scene.elements.fields import (
     LAW_ANGLES,
@@ -198,7 +199,8 @@ class LawProfile(AbstractProfile):
     def mistakes(cls, table: Mapping[str, object]) -> Iterator[str]:
         """Iterate over the mistakes in a table that concern several keys, each with its key."""
         law, angle = table.get("law"), table.get("angle")
-        if isinstance(law, list | tuple) and np.ndim(angle) == 1 and len(law) != np.shape(angle)[0]:  # pyright: ignore
+        count = len(angle) if isinstance(angle, list | tuple) else angle.size if is_array(angle) and angle.ndim == 1 else None
+        if isinstance(law, list | tuple) and count is not None and len(law) != count:
             yield f"law: must have as many entries as angle and {cls.step_field}"
 
 

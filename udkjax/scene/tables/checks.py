@@ -4,6 +4,7 @@ import dataclasses
 import unicodedata
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cache
+from types import MappingProxyType
 from typing import Any, Literal, NamedTuple, get_args, get_origin
 
 import equinox as eqx
@@ -173,15 +174,25 @@ def _short(key: Any) -> str:
     return abbreviate(key) if isinstance(key, str) and len(key) > LONGEST_QUOTE else f"{key}"
 
 
-def check_table(where: str, cls: type, table: TomlTable, known: KnownNames) -> Iterator[str]:
-    """Iterate over the mistakes in a table that describes an element of class `cls`."""
+def check_table(
+    where: str, cls: type, table: TomlTable, known: KnownNames, written: TomlTable = MappingProxyType({})
+) -> Iterator[str]:
+    """Iterate over the mistakes in a table that describes an element of class `cls`.
+
+    Args:
+        where: The path of the table.
+        cls: The class.
+        table: The table, with numbers in SI units.
+        known: The elements to which it may refer.
+        written: The table as it was written, in other units, for messages; empty if these are the same.
+    """
     expected, sizes = keys(cls), ListSizes()
     for name in table:
         if name not in expected:
             yield f"{where}.{_short(name)}: {unknown_key(name, expected)}"
     for name, key in expected.items():
         if name in table:
-            yield from _check_value(f"{where}.{name}", key.annotation, table[name], key.metadata, sizes)
+            yield from _check_value(f"{where}.{name}", key.annotation, table[name], key.metadata, sizes, written.get(name))
             yield from _check_references(f"{where}.{name}", key.metadata.get("names"), table[name], known)
         elif key.required:
             yield f"{where}.{name}: missing"
@@ -195,15 +206,20 @@ def check_table(where: str, cls: type, table: TomlTable, known: KnownNames) -> I
         yield from (f"{where}.{mistake}" for mistake in cls.mistakes(table))
 
 
-def _check_value(path: str, annotation: Any, value: object, metadata: FieldMetadata, sizes: ListSizes) -> Iterator[str]:
-    """Iterate over the mistakes in one value. `sizes` collects the lengths of the named dimensions."""
+def _check_value(
+    path: str, annotation: Any, value: object, metadata: FieldMetadata, sizes: ListSizes, written: object = None
+) -> Iterator[str]:
+    """Iterate over the mistakes in one value. `sizes` collects the lengths of the named dimensions.
+
+    `written` is the value as it was written, in another unit; None if this is the same.
+    """
     value = value.value if isinstance(value, StaticValue) else value
     annotation, sampled_class = with_samples(annotation)
     if sampled_class and isinstance(value, sampled_class | dict):
         yield from _check_held(path, annotation.dim_str.split(), value)
         return
     if hasattr(annotation, "dim_str"):
-        yield from _check_number(path, annotation.dim_str.split(), value, metadata, sizes)
+        yield from _check_number(path, annotation.dim_str.split(), value, metadata, sizes, written)
     elif get_origin(annotation) is Literal:
         if not isinstance(value, str) or value not in get_args(annotation):
             choices = ", ".join(quote(choice) for choice in get_args(annotation))
@@ -218,11 +234,11 @@ def _check_value(path: str, annotation: Any, value: object, metadata: FieldMetad
             for k, item in enumerate(value):
                 yield from _check_value(f"{path}[{k}]", Literal[choices], item, {}, sizes)  # pyright: ignore
     elif isinstance(annotation, type) and issubclass(annotation, eqx.Module):
-        yield from _check_nested(path, annotation, value)
+        yield from _check_nested(path, annotation, value, written if isinstance(written, Mapping) else {})
 
 
-def _check_nested(path: str, annotation: type, value: object) -> Iterator[str]:
-    """Iterate over the mistakes in a motion law or a profile: a module in Python, a table in a file."""
+def _check_nested(path: str, annotation: type, value: object, written: TomlTable) -> Iterator[str]:
+    """Iterate over the mistakes in a motion law or a profile: a module in Python, a table in a file, `written` as there."""
     if isinstance(value, Held) and annotation is not Held:
         yield f"{path}: a motion that is held jumps at each sample: give a Spline through its values"
     elif isinstance(value, annotation) and isinstance(value, eqx.Module):
@@ -230,15 +246,15 @@ def _check_nested(path: str, annotation: type, value: object) -> Iterator[str]:
     elif not isinstance(value, dict):
         yield f"{path}: must be a table, not {abbreviate(value)}"
     elif annotation is AbstractProfile:
-        yield from check_table(path, profile_class(value), value, {})
+        yield from check_table(path, profile_class(value), value, {}, written)
     elif annotation in CLASSES_WITHOUT_TYPE.values():
-        yield from check_table(path, annotation, value, {})
+        yield from check_table(path, annotation, value, {}, written)
     else:
         cls, problem = find_class(path, CLASSES_BY_TYPE["motion"], value)
         if cls is None:
             yield problem
         else:
-            yield from check_table(path, cls, {name: v for name, v in value.items() if name != "type"}, {})
+            yield from check_table(path, cls, {name: v for name, v in value.items() if name != "type"}, {}, written)
 
 
 def _check_held(path: str, dims: Sequence[str], value: Any) -> Iterator[str]:
@@ -269,35 +285,55 @@ def find_class(path: str, choices: Mapping[str, type], table: TomlTable) -> tupl
     )
 
 
-def _check_number(path: str, dims: Sequence[str], value: Any, metadata: FieldMetadata, sizes: ListSizes) -> Iterator[str]:
+def _check_number(
+    path: str, dims: Sequence[str], value: Any, metadata: FieldMetadata, sizes: ListSizes, written: object = None
+) -> Iterator[str]:
     """Iterate over the mistakes in a number: its type, its shape and, if concrete, its value."""
     traced = is_traced(value)
     array = jnp.asarray(value) if traced else _as_array(value)
-    is_fixed = all(dim.isdigit() for dim in dims)
+    is_fixed, shown = all(dim.isdigit() for dim in dims), value if written is None else written
     if array is not None and dims[-1:] == ["..."]:
         dims = [*dims[:-1], *map(str, array.shape[len(dims) - 1 :])]
-    if array is None or array.ndim != len(dims) or (is_fixed and array.shape != tuple(map(int, dims))):
+    if array is None or array.ndim != len(dims) or not _has_sizes(array, dims):
         expected = f"{' x '.join(dims)} numbers" if is_fixed else "numbers"
-        yield f"{path}: must be {f'a list of {expected}' if dims else 'a number'}, not {abbreviate(value)}"
+        if not is_fixed and dims[-1].isdigit():
+            expected = f"{'lists of ' * (len(dims) - 1)}{dims[-1]} numbers"
+        yield f"{path}: must be {f'a list of {expected}' if dims else 'a number'}, not {abbreviate(shown)}"
         return
     for dim, size in zip(dims, array.shape, strict=True):
         if not dim.isdigit() and (known := sizes.setdefault(dim, (size, path.rpartition(".")[2])))[0] != size:
-            yield f"{path}: must have {known[0]} entries, like {known[1]}, not {abbreviate(value)}"
+            yield f"{path}: must have {known[0]} entries, like {known[1]}, not {abbreviate(shown)}"
             return
     if array.ndim and len(array) < metadata.get("at_least", 0):
         yield f"{path}: needs at least {metadata.get('at_least')} entries, not {abbreviate(value)}"
     if not isinstance(array, np.ndarray):
         return
     wrong = ~np.isfinite(array)
-    yield from _check_entries(path, array, wrong, "must be finite")
+    yield from _check_entries(path, array, wrong, "must be finite", written)
     if array.size and not wrong.any():
         for requirement in metadata.get("require", ()):
-            yield from _check_entries(path, array, ~requirement.holds(array), requirement.text)
+            if requirement.shown_sum is None:
+                yield from _check_entries(path, array, ~requirement.holds(array), requirement.text, written)
+            elif not np.all(requirement.holds(array)):
+                yield f"{path}: {requirement.text}, not {requirement.shown_sum(float(array.sum()))}"
 
 
-def _check_entries(path: str, array: np.ndarray, wrong: np.ndarray, text: str) -> Iterator[str]:
+def _has_sizes(array: Any, dims: Sequence[str]) -> bool:
+    """Return True if an array has the sizes of all dimensions that are numbers, as the second of "n 2"."""
+    return all(int(dim) == size for dim, size in zip(dims, array.shape, strict=True) if dim.isdigit())
+
+
+def _check_entries(path: str, array: np.ndarray, wrong: np.ndarray, text: str, written: object) -> Iterator[str]:
     for index in map(tuple, np.argwhere(wrong) if np.any(wrong) else ()):
-        yield f"{path}{''.join(f'[{i}]' for i in index)}: {text}, not {abbreviate(float(array[index]))}"
+        shown = abbreviate(_written_entry(written, index, float(array[index])))
+        yield f"{path}{''.join(f'[{i}]' for i in index)}: {text}, not {shown}"
+
+
+def _written_entry(written: object, index: Sequence[int], number: float) -> object:
+    """Return an entry as it was written, a number or a text; `number` if it was not."""
+    for k in index:
+        written = written[k] if isinstance(written, list | tuple) else None
+    return written if isinstance(written, int | float | str) and not isinstance(written, bool) else number
 
 
 def _as_array(value: object) -> np.ndarray | None:

@@ -10,13 +10,14 @@ from jaxtyping import Float
 
 from udkjax.annotations import JsonObject, Numbers
 from udkjax.argument_types import COORDINATES_OF_BODIES, require_history
+from udkjax.arrays import ROUNDING
 from udkjax.equations.systems.general import ConstrainedSystem
 from udkjax.extras import WRITING_PACKAGES, require
 from udkjax.integrate.events.law.conditions import Gap
 from udkjax.integrate.events.law.event import EventsLike, ExpandsToEvents, expand_events, listed_events
 from udkjax.integrate.simulate import simulate
 from udkjax.positions.gaps.gaps import LeastGaps
-from udkjax.requirements import concrete_only
+from udkjax.requirements import ArgumentError, concrete_only
 from udkjax.scene.arguments import checked, require_mechanism
 from udkjax.scene.mechanism import Mechanism
 from udkjax.show.player import pictures
@@ -104,7 +105,7 @@ class Animation:
             The path.
 
         Raises:
-            ValueError: the suffix of the path is unknown.
+            ValueError: the suffix of the path is unknown, or the motion does not contain the time.
             ImportError: a package is missing; the message names the extra that installs it.
         """
         path = Path(path)
@@ -134,7 +135,7 @@ class Animation:
 
         t is in s, or for modes the fraction of a cycle; by default it is the start of the motion.
         """
-        t = float(self.data["start"] if t is None else t)
+        t = self._time(t)
         return [motion(t) for motion in self._motions]
 
     def paths(self) -> list[list[TracedPath]]:
@@ -145,12 +146,12 @@ class Animation:
 
     def arrows(self, t: float | None = None) -> list[list[ForceArrow]]:
         """Return the arrows of the reactions of each run at time t (s), by default at the start; none if they are not shown."""
-        t = float(self.data["start"] if t is None else t)
+        t = self._time(t)
         return [arrows(t) for arrows in self._arrows]
 
     def sticking(self, t: float | None = None) -> list[list[list[float]]]:
         """Return the places [body, x, y] of the joints of each run that stick at time t (s), by default at the start."""
-        t = float(self.data["start"] if t is None else t)
+        t = self._time(t)
         return [stuck_at(record, t) for record in self.data["runs"]]
 
     def touching(self, t: float | None = None) -> list[list[JsonObject]]:
@@ -170,6 +171,17 @@ class Animation:
         """Return the names of points and the lengths of links of each run."""
         shown = zip(self.mechanisms, self.data["runs"], strict=True)
         return [labels_of(mechanism, run["marks"]) for mechanism, run in shown]
+
+    def _time(self, t: float | None) -> float:
+        """Return the time of a pose, by default the start of the motion; raise an error if the motion does not contain it."""
+        start, end = float(self.data["start"]), float(self.data["end"])
+        if t is None:
+            return start
+        margin = ROUNDING * max(abs(start), abs(end))
+        if not start - margin <= t <= end + margin:
+            unit = "" if self.data["runs"][0]["mode"] else " s"
+            raise ArgumentError(f"t must be a time of the motion, from {start:g} to {end:g}{unit}, not {t:g}{unit}")
+        return float(t)
 
     def _repr_html_(self) -> str:
         return frame(self.data, FRAME_HEIGHT)

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from udkjax.extras import OptionalImport
+from udkjax.requirements import ArgumentError, require_count, require_number
 from udkjax.show.player.marks.sketch import THEMES, Circle, Line, Text
 from udkjax.show.player.pictures import Posed, sketches
 
@@ -21,6 +22,7 @@ GIF_TICK = 0.01  # unit of a GIF's frame times (s)
 
 def image(animation: Posed, t: float | None = None, width: int = 640, theme: str = "light", labels: bool = False) -> Image.Image:
     """Return one pose of each run, side by side, as a bitmap of about `width` px; t is the time (s), by default the start."""
+    require_count("width", width)
     view, sketches_at_t = sketches(animation, t, width, theme, OVERSAMPLING, labels)
     large = Image.new("RGB", (view.width * len(sketches_at_t), view.height), THEMES[theme]["back"])
     for k, sketch in enumerate(sketches_at_t):
@@ -69,15 +71,15 @@ def film_times(animation: Posed, fps: float, speed: float | None) -> np.ndarray:
     """Return the time (s) of the motion at each frame; `speed` is that of the player by default.
 
     Raises:
-        ValueError: the film would be too long, or `fps` or `speed` is not positive.
+        ArgumentError: the film would be too long, or `fps` or `speed` is not positive.
     """
     data = animation.data
     speed = float(data["speed"] if speed is None else speed)
-    if not (0 < fps < np.inf and 0 < speed < np.inf):
-        raise ValueError(f"fps {fps:g} and speed {speed:g} must be positive")
+    for name, value in (("fps", fps), ("speed", speed)):
+        require_number(name, value, "positive")
     count = max(1, round((data["end"] - data["start"]) / speed * fps))
     if count > MOST_FRAMES:
-        raise ValueError(
+        raise ArgumentError(
             f"{count} frames are more than {MOST_FRAMES}: give a higher speed than {speed:g}, or fewer fps than {fps:g}"
         )
     return data["start"] + speed / fps * np.arange(count)
@@ -87,6 +89,7 @@ def save_gif(
     animation: Posed, path: Path, fps: float = 25.0, width: int = 480, theme: str = "light", speed: float | None = None
 ) -> None:
     """Write the motion as a GIF that repeats forever; `fps` is rounded to 100 divided by an integer, the resolution of GIFs."""
+    require_number("fps", fps, "positive")
     tick = max(2, round(1 / fps / GIF_TICK))  # browsers play faster GIFs slowly
     times = film_times(animation, 1 / (tick * GIF_TICK), speed)
     palette = _palette(image(animation, times[0], width, theme))  # the same for all frames, to avoid flicker

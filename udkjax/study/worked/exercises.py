@@ -82,9 +82,12 @@ def read_variation(mechanism: Mechanism, text: str) -> Variation:
     if match is None or not isinstance(drawing, Drawing):
         raise SceneError([f'vary: {quote(text)} must be a number and its range, such as "length(crank) 35..45 mm"'])
     title, unit, units = match[1], match[4] or "", Units(dict(drawing.units))
-    low, high = float(match[2]), float(match[3])
-    if not low < high:
-        raise SceneError([f"vary: {quote(text)}: the range must increase"])
+    try:
+        low, high = float(match[2]), float(match[3])
+    except ValueError as problem:  # two points in a number
+        raise SceneError([f"vary: {quote(text)}: {problem}"]) from None
+    if not -np.inf < low < high < np.inf:
+        raise SceneError([f"vary: {quote(text)}: the range must increase, between finite numbers"])
     if title == AT_NAME:
         return Variation(title, AT_NAME, low, high, unit or Count.of(mechanism, only_driver(mechanism)).unit, 1.0)
     length = re.fullmatch(r"length\((.+)\)", title)
@@ -140,9 +143,11 @@ def exercises(
         digits: significant digits of printed numbers.
 
     Raises:
-        SceneError: ranges in which too few numbers assemble and turn.
+        SceneError: `at` is not a value of the driver, or in the ranges too few numbers assemble and turn.
     """
     driver, taken = only_driver(mechanism), set()
+    if all(one.name != AT_NAME for one in vary):
+        Count.of(mechanism, driver).read(at, "at")  # refuses what is no value, before numbers are tried
     turns = not np.isfinite([float(travel(mechanism, driver).lower), float(travel(mechanism, driver).upper)]).any()
     for k, student in enumerate(students):
         rng, why = np.random.default_rng([seed, k]), ""
