@@ -1,7 +1,5 @@
 """Values of the wrong shape, and numbers beyond the range of floats, at every place of scenes and drawings."""
 
-import copy
-import json
 import tomllib
 from pathlib import Path
 
@@ -10,6 +8,7 @@ import pytest
 
 import udkjax as udk
 from tests.scene.drawing.test_drawing_files import EVERYTHING
+from tests.wrong_values import WRONG, places, toml_text, with_value
 
 CAM = """format = 2
 ground = ["O"]
@@ -39,37 +38,6 @@ profile = {base = "base", law = ["cycloidal", "harmonic"], angle = [180, 180], l
 EXAMPLES = Path(__file__).parents[2] / "examples"
 SCENES = {name: (EXAMPLES / f"{name}.toml").read_text() for name in ("driven_pendulum", "planetary_gear", "slider_crank")}
 SCENES |= {"drawing": EVERYTHING, "cam": CAM}
-HUGE = int("1" + "0" * 400)
-WRONG = {"ragged": [[1, 2], [3]], "empty": [[[]]], "huge": HUGE, "huge in a list": [HUGE, 0], "infinite": [float("inf"), 1]}
-
-
-def toml(value) -> str:
-    if isinstance(value, dict):
-        return "{" + ", ".join(f"{json.dumps(key)} = {toml(x)}" for key, x in value.items()) + "}"
-    if isinstance(value, list):
-        return f"[{', '.join(map(toml, value))}]"
-    return str(value) if isinstance(value, float | int) and not isinstance(value, bool) else json.dumps(value)
-
-
-def toml_text(scene: dict) -> str:
-    return "\n".join(f"{key} = {toml(value)}" for key, value in scene.items())
-
-
-def places(value, path=()):
-    """Yield the paths of all numbers, texts and lists of a scene."""
-    for key, x in value.items() if isinstance(value, dict) else enumerate(value):
-        if not isinstance(x, dict) and not (isinstance(x, list) and any(isinstance(entry, dict) for entry in x)):
-            yield (*path, key)
-        if isinstance(x, dict | list):
-            yield from places(x, (*path, key))
-
-
-def with_value(scene, path, value):
-    changed = holder = copy.deepcopy(scene)
-    for key in path[:-1]:
-        holder = holder[key]
-    holder[path[-1]] = value
-    return changed
 
 
 @pytest.mark.parametrize("name", SCENES)

@@ -271,6 +271,8 @@ def _answers(solution):
     [
         ("length(crank)", "must be a number and its range"),
         ("length(crank) 45..35 mm", "must increase"),
+        ("length(crank) 35..1e999 mm", "between finite numbers"),
+        ("length(crank) 3.5.1..45 mm", "3.5.1"),
         ("length(krank) 35..45 mm", 'did you mean "crank"'),
         ("length(crank) 35..45 kg", "does not fit"),
         ("pin.Q.length 1..2", "no number named"),

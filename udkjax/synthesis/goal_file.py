@@ -21,7 +21,7 @@ from udkjax.synthesis.design import DesignSearch
 from udkjax.synthesis.goals import FunctionGoal, Goal, PathGoal, PoseGoal
 from udkjax.synthesis.motion_goals import EnergyGoal, FrequencyGoal, GapGoal, LoadGoal, MotionTerm, ToleranceGoal, TorqueGoal
 from udkjax.synthesis.robust_goal import RobustGoal
-from udkjax.wording import plural, quote, unknown_key
+from udkjax.wording import abbreviate, plural, quote, unknown_key
 
 TOP_KEYS = (
     "mechanism",
@@ -104,6 +104,8 @@ def read_design(path: str | os.PathLike[str]) -> DesignSearch | CompleteSearch:
     terms = [_read_motion(where, mechanism, goal, entry, units, problems) for where, entry in motions]
     areas = {pin: units.convert(f"areas.{pin}", area, "m", problems) for pin, area in dict(table.get("areas", {})).items()}
     transmission = units.convert("transmission", table.get("transmission", 0.0), "rad", problems)
+    if isinstance(transmission, bool) or not isinstance(transmission, float | int | None):
+        problems.append(f"transmission: must be an angle, not {abbreviate(table['transmission'])}")
     if problems:
         raise SceneError(problems, name)
     assert goal is not None and isinstance(transmission, float | int)
@@ -153,7 +155,7 @@ def _with_table(goal: Any, folder: Path, problems: list[str]) -> Any:
 
 def _read_goal(mechanism: Mechanism, table: Any, units: Units, problems: list[str]) -> Goal | None:
     kind = table.get("kind") if isinstance(table, Mapping) else None
-    if kind not in GOAL_KINDS:
+    if not isinstance(kind, str) or kind not in GOAL_KINDS:
         problems.append(f"goal.kind must be one of {', '.join(map(quote, GOAL_KINDS))}, not {quote(str(kind))}")
         return None
     make, keys = GOAL_KINDS[kind]
@@ -182,7 +184,7 @@ def _read_motion(
     kind = table.get("kind") if isinstance(table, Mapping) else None
     if kind == "robust":
         return _read_robust(where, mechanism, goal, table, units, problems)
-    if kind not in MOTION_KINDS:
+    if not isinstance(kind, str) or kind not in MOTION_KINDS:
         problems.append(f"{where}.kind must be one of {', '.join(map(quote, (*MOTION_KINDS, 'robust')))}, not {quote(str(kind))}")
         return None
     make, unit = MOTION_KINDS[kind]
@@ -274,7 +276,7 @@ def _read_lengths(tables: Any, units: Units, problems: list[str]) -> dict[tuple[
         where = f"length[{k}]"
         problems += [f"{where}.{key}: {unknown_key(key, LENGTH_KEYS)}" for key in table if key not in LENGTH_KEYS]
         pins = table.get("pins")
-        if not isinstance(pins, list) or len(pins) != 2:
+        if not isinstance(pins, list) or len(pins) != 2 or not all(isinstance(pin, str) for pin in pins):
             problems.append(f'{where}.pins: must name two pins, such as ["A", "B"]')
             continue
         least = units.convert(f"{where}.least", table.get("least", 0.0), "m", problems)

@@ -11,6 +11,7 @@ from PIL import Image
 
 import udkjax as udk
 from udkjax.integrate.events.law.conditions import Gap
+from udkjax.requirements import ArgumentError
 from udkjax.show.player import films
 from udkjax.show.player.marks.marks import marks
 from udkjax.show.player.marks.sketch import THEMES, Sketch, Text, view_of
@@ -253,6 +254,25 @@ def test_wrong_names_and_themes(animation, tmp_path):
         animation.save(tmp_path / "motion.bmp")
     with pytest.raises(ValueError, match="theme 'blue'"):
         animation.save(tmp_path / "pose.png", theme="blue")
+
+
+@pytest.mark.parametrize(
+    ("name", "given", "message"),
+    [
+        ("motion.gif", {"fps": 0}, "fps must be positive"),
+        ("motion.gif", {"speed": np.nan}, "speed must be positive"),
+        ("motion.mp4", {"fps": -1}, "fps must be positive"),
+        ("motion.gif", {"width": 0}, "width must be at least 1"),
+        ("pose.png", {"width": 0}, "width must be at least 1"),
+        ("pose.svg", {"width": -5}, "width must be at least 1"),
+        ("pose.svg", {"t": 1e3}, "t must be a time of the motion, from 0 to 2 s, not 1000 s"),
+        ("pose.png", {"t": -0.1}, "t must be a time of the motion"),
+        ("pose.dxf", {"t": np.nan}, "t must be a time of the motion"),
+    ],
+)
+def test_sizes_and_times_that_cannot_be_drawn_are_refused_by_name(animation, tmp_path, name, given, message):
+    with pytest.raises(ArgumentError, match=message):
+        animation.save(tmp_path / name, **given)
 
 
 def assert_paths_of_slider_crank(paths, atol):

@@ -101,6 +101,7 @@ def test_output_times():
         ("t1 = 1.0\naxes.a = {from = 1, to = 2, num = 0}", "axes.a.num: must be a whole number, at least 1, not 0"),
         ("t1 = 1.0\naxes.a = {from = 0, to = 2, num = 3, scale = 'log'}", "axes.a: from and to must be positive"),
         ("t1 = 1.0\naxes.a = {from = 1, to = 2, num = 3, scale = 'lin'}", 'axes.a.scale: must be one of "linear", "log"'),
+        ("t1 = 1.0\naxes.a = {from = 1, to = 2, num = 3, scale = ['log']}", 'axes.a.scale: must be one of "linear", "log"'),
         ("t1 = 1.0\naxes.method = ['auto', 'sdv']", 'axes.method[1]: unknown method "sdv"; did you mean "svd"?'),
         ("t1 = 1.0\naxes.a = {zipped = {rtol = [1], method = ['x']}}", 'axes.a.zipped.method[0]: unknown method "x"'),
         ("t1 = 1.0\naxes.a = {values = [1], units = 3}", "axes.a.units: must be a string, not 3"),

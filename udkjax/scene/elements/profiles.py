@@ -199,8 +199,8 @@ class LawProfile(AbstractProfile):
     def mistakes(cls, table: Mapping[str, object]) -> Iterator[str]:
         """Iterate over the mistakes in a table that concern several keys, each with its key."""
         law, angle = table.get("law"), table.get("angle")
-        count = len(angle) if isinstance(angle, list | tuple) else angle.size if is_array(angle) and angle.ndim == 1 else None
-        if isinstance(law, list | tuple) and count is not None and len(law) != count:
+        is_list = isinstance(angle, list | tuple) or (is_array(angle) and np.ndim(angle) == 1)  # pyright: ignore
+        if isinstance(law, list | tuple) and is_list and len(law) != len(angle):  # pyright: ignore
             yield f"law: must have as many entries as angle and {cls.step_field}"
 
 

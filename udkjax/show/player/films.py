@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from udkjax.extras import OptionalImport
-from udkjax.requirements import ArgumentError, require_count, require_number
+from udkjax.requirements import ArgumentError, require_number
 from udkjax.show.player.marks.sketch import THEMES, Circle, Line, Text
 from udkjax.show.player.pictures import Posed, sketches
 
@@ -22,7 +22,6 @@ GIF_TICK = 0.01  # unit of a GIF's frame times (s)
 
 def image(animation: Posed, t: float | None = None, width: int = 640, theme: str = "light", labels: bool = False) -> Image.Image:
     """Return one pose of each run, side by side, as a bitmap of about `width` px; t is the time (s), by default the start."""
-    require_count("width", width)
     view, sketches_at_t = sketches(animation, t, width, theme, OVERSAMPLING, labels)
     large = Image.new("RGB", (view.width * len(sketches_at_t), view.height), THEMES[theme]["back"])
     for k, sketch in enumerate(sketches_at_t):

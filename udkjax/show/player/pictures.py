@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from udkjax.annotations import JsonObject
 from udkjax.extras import OptionalImport
+from udkjax.requirements import require_count
 from udkjax.show.player.marks.mark_kinds import MarkKind
 from udkjax.show.player.marks.sketch import (
     THEMES,
@@ -79,6 +80,7 @@ def sketches(
         times: factor by which the panels are enlarged.
         labels: True to add the names of points and the lengths of links to the sketches.
     """
+    require_count("width", width)
     if theme not in THEMES:
         raise ValueError(f"theme {theme!r} must be {' or '.join(THEMES)}")
     runs = animation.data["runs"]

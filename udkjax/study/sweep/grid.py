@@ -161,7 +161,7 @@ class _GridReader:
         low, high = (self.number(f"{path}.{key}", given[key]) if key in given else None for key in ("from", "to"))
         num = self.whole(f"{path}.num", given.get("num", 2), 1)
         scale = given.get("scale", "linear")
-        if scale not in SCALES:
+        if not isinstance(scale, str) or scale not in SCALES:
             self.wrong(f"{path}.scale", f"must be one of {', '.join(map(quote, SCALES))}, not {abbreviate(scale)}")
         elif scale == "log" and low is not None and high is not None and min(low, high) <= 0:
             self.wrong(path, 'from and to must be positive if scale is "log"')

@@ -147,7 +147,7 @@ def exercises(
     """
     driver, taken = only_driver(mechanism), set()
     if all(one.name != AT_NAME for one in vary):
-        Count.of(mechanism, driver).read(at, "at")  # refuses what is no value, before numbers are tried
+        Count.of(mechanism, driver).read(at, "at")  # raises an error now, not in each trial
     turns = not np.isfinite([float(travel(mechanism, driver).lower), float(travel(mechanism, driver).upper)]).any()
     for k, student in enumerate(students):
         rng, why = np.random.default_rng([seed, k]), ""
