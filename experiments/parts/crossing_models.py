@@ -144,6 +144,20 @@ def belt() -> udk.Mechanism:
     ).mechanism()
 
 
+def cam_of_laws() -> udk.Mechanism:
+    """A drawn cam that moves a follower along its slide by laws."""
+    profile = {"base": 40, "law": ["4-5-6-7", "4-5-6-7"], "angle": [180, 180], "lift": [20, -20]}
+    return udk.Drawing(
+        pins={"O": (0, 0), "P": (0, 40)},
+        links={"cam": {"pins": ["O"], "mass": 1, "width": 60}, "follower": {"pins": ["P"], "mass": 1, "width": 10}},
+        ground=["O"],
+        slides=[{"link": "follower", "direction": [0, 1]}],
+        cams=[{"pins": ["O", "P"], "profile": profile}],
+        motors=[{"pin": "O", "speed": "60 rpm"}],
+        units={"length": "mm", "angle": "deg"},
+    ).mechanism()
+
+
 def smooth_slide() -> udk.Mechanism:
     """A slider-crank whose guide rubs by its load."""
     scene = udk.library.slider_crank()
@@ -247,6 +261,7 @@ MODELS: dict[str, Model] = {
     "rack": Model(lambda: wheels("rack")),
     "belt": Model(belt),
     "cam": Model(lambda: udk.load(EXAMPLES / "drawings" / "cam_follower.toml")),
+    "cam of laws, drawn": Model(cam_of_laws),
     "slots": Model(udk.library.elliptic_trammel),
     "no gravity": Model(
         lambda: udk.Mechanism(plain().bodies, plain().joints, None, [udk.TorsionSpring(["ground", CRANK], 1.0)], [0.0, 0.0])
