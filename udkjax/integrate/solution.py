@@ -81,7 +81,8 @@ CAUSES = {
     "driver, or joints that neither stick nor slide, as their friction jams them",
     Result.invalid_argument: "an argument of this run cannot be used: output times that do not increase, a state that is not "
     "finite, a tolerance or first step that is not positive, or a number of the scene or of an event that cannot be: one that is "
-    "not finite, a mass that is not positive, knots that do not increase, a lower limit above the upper one",
+    "not finite, a mass that is not positive, knots that do not increase, a lower limit above the upper one; or "
+    "the drawing cannot be drawn with its numbers",
     Result.singular: "the run, which is not projected, met a singular configuration with its constraints too far open: it may "
     "have lost its energy, or gone on along another branch; use `Projection()`",
     Result.spurious_rank: "rows that depend on others along the whole motion counted as independent, and hold back what is free "

@@ -180,3 +180,28 @@ def test_the_fingerprint_tells_what_decides_the_results(linkage):
         of(derivatives=["body.link1.mass"]),
     ]
     assert all(base != other for other in others) and all(a != b for a, b in pairwise(others))
+
+
+def four_bar_of(crank, coupler, rocker, ground):
+    pins = {
+        "O": (0, 0),
+        "C": (ground, 0),
+        "A": udk.polar("O", crank, 1.0),
+        "B": udk.circles(("A", "C"), (coupler, rocker), "left"),
+    }
+    links = {name: {"pins": ends, "mass": 1.0, "width": 0.01} for name, ends in (("a", "OA"), ("b", "AB"), ("c", "CB"))}
+    return udk.Drawing(pins, {name: link | {"pins": list(link["pins"])} for name, link in links.items()}, ["O", "C"]).mechanism()
+
+
+def test_numbers_of_a_drawing_are_checked_together_and_members_that_cannot_be_drawn_are_data():
+    scene, longer = four_bar_of(0.04, 0.12, 0.08, 0.1), np.array([1.0, 10.0])
+    axes = {"pin.C[0]": 0.1, "pin.A.length": 0.04, "pin.B.length[0]": 0.12, "pin.B.length[1]": 0.08}
+    scaled = udk.Zipped({name: x * longer for name, x in axes.items()})
+    data = udk.sweep(scene, {"size": scaled}, [0.0, 0.1], ["final"], progress=False)
+    alone = udk.simulate(four_bar_of(0.4, 1.2, 0.8, 1.0), [0.0, 0.1])
+    assert np.all(data.result == 0)
+    np.testing.assert_allclose(data.q_end[1], alone.q[-1], rtol=1e-6)
+    data = udk.sweep(scene, {"pin.A.length": [0.04, 0.4]}, [0.0, 0.1], ["final"], progress=False)
+    assert data.result.values.tolist() == [udk.Result.successful, udk.Result.invalid_argument]
+    with pytest.raises(udk.SweepError, match=r'axis "pin.A.length": pins.A.length: must be > 0, not -1'):
+        udk.sweep(scene, {"pin.A.length": [0.04, -1.0]}, [0.0, 0.1])

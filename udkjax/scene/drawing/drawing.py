@@ -35,7 +35,7 @@ from udkjax.scene.numbers.description import drawing_table
 from udkjax.scene.numbers.named_numbers import Formula, with_expressions, without_expressions
 from udkjax.scene.numbers.number_fields import ElementGroups
 from udkjax.scene.numbers.sources import AbstractDrawing, Drawn, Follows, is_number
-from udkjax.scene.tables.checks import SceneEntry, SceneError
+from udkjax.scene.tables.checks import PlacementError, SceneEntry, SceneError
 from udkjax.scene.tables.element_setup import name_elements
 from udkjax.scene.tables.schema import table_of
 from udkjax.wording import abbreviate, quote, suggestion
@@ -306,7 +306,7 @@ class Drawing(AbstractDrawing):
         units = Units(dict(self.units))
         checked = read_drawing([*pin_entries(plain["pin"], {}), *drawn], self.ground, gravity, Units(), units)
         if checked.problems:
-            raise SceneError(checked.problems, self.name)
+            raise (PlacementError if checked.are_misplaced else SceneError)(checked.problems, self.name)
         own = without_expressions(checked.groups | {"number": plain["number"]}, self.formulas)
         changed = {"gravity": gravity, "massless": _without_mass(checked.groups), "_elements": _in_order(own)[1]}
         return make_module(Drawing, **vars(self) | changed)

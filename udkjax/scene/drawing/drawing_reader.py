@@ -53,6 +53,7 @@ class DrawingElements(NamedTuple):
     gravity: Any
     problems: list[str]
     formulas: tuple[Formula, ...] = ()  # numbers that expressions give, in the order in which they follow from each other
+    are_misplaced: bool = False  # whether the only mistakes are that elements cannot be placed with these numbers
 
 
 def read_drawing(
@@ -113,17 +114,18 @@ def read_drawing(
     if any(len(groups[s]) < len(named[s]) for s in ("pin", "link")) or any(pin not in named["pin"] for pin in fixed_pins):
         return DrawingElements(groups, gravity, problems)
     if misplaced := list(pin_mistakes(groups["pin"], shown or units)):
-        return DrawingElements(groups, gravity, [*problems, *misplaced])
+        return DrawingElements(groups, gravity, [*problems, *misplaced], are_misplaced=not problems)
     layout = PinLayout(groups["link"], fixed_pins, groups["slide"])
     all_read = all(len(groups[section]) == len(named[section]) for section in groups)
     problems += layout_mistakes(layout, groups, fixed_pins, all_read)
+    count = len(problems)
     if not is_traced((groups["pin"], groups["link"])):
         drawn = concrete_elements(groups)
         problems += shape_mistakes(drawn["pin"], drawn["link"], {slot.pin for slot in drawn["slot"].values()})
         if not problems and not is_traced([groups[section] for section in ("slide", "slot", "gear", "cam")]):
             with jax.ensure_compile_time_eval():  # concrete even while something else is traced
                 problems += gap_mistakes(placement_of(drawn, fixed_pins), drawn)
-    return DrawingElements(groups, gravity, problems, tuple(formulas))
+    return DrawingElements(groups, gravity, problems, tuple(formulas), not count and len(problems) > 0)
 
 
 def _read_element(

@@ -92,8 +92,8 @@ class Placement(PinLayout):
             line = self.places[along[1]] - self.places[along[0]]
             direction = array_namespace(line).arctan2(line[1], line[0])
         assert direction is not None  # given, because `along` is not
-        direction = by_numpy(direction)
-        return direction if on == GROUND else direction - self.angle(on)
+        angle: Number = by_numpy(direction)
+        return angle if on == GROUND else angle - self.angle(on)
 
     def guide(self, slide: SlidingLink) -> tuple[tuple[str, str], Float[Array, "2 2"], Number]:
         """Return the two links of a slide, its points in their frames (m), and its direction in the frame of the first (rad)."""

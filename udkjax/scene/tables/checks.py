@@ -57,6 +57,10 @@ class SceneError(Mistakes):
     subject = "scene"
 
 
+class PlacementError(SceneError):
+    """An error for numbers of a drawing that may be given, each of them, but with which its elements cannot be placed."""
+
+
 class SceneEntry(NamedTuple):
     """One element to check: its section and index, its name, its class (None if unknown) and its table."""
 

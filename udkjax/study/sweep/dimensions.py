@@ -19,7 +19,7 @@ from udkjax.scene.arguments import argument_problems
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.numbers.number_fields import split_index
 from udkjax.scene.numbers.units import NUMBERS
-from udkjax.scene.tables.checks import Mistakes, SceneError
+from udkjax.scene.tables.checks import Mistakes, PlacementError, SceneError
 from udkjax.study.quantities import StudyModel
 from udkjax.study.sweep.axes import (
     NONE_LABELS,
@@ -214,12 +214,17 @@ def _suggest_ending(target: str, parameters: Iterable[str]) -> str:
 
 
 def _misfits(mechanism: StudyModel, name: str, of: Sequence[str], numbers: np.ndarray) -> Iterator[str]:
-    """Iterate over mistakes of values that violate the shape or a requirement of a parameter or setting."""
+    """Iterate over mistakes of values that violate the shape or a requirement of a parameter or setting.
+
+    Whether the numbers of several axes fit together in a drawing is seen by each member.
+    """
     parameters = [target for target in of if target not in NUMBERS]
     if parameters:
         for value in (numbers.min(axis=0), numbers.max(axis=0)):
             try:
                 mechanism.with_parameters(dict.fromkeys(parameters, value))
+            except PlacementError:
+                continue
             except SceneError as error:
                 yield from (f"axis {quote(name)}: {problem}" for problem in error.problems)
                 return
