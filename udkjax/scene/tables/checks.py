@@ -52,13 +52,17 @@ class SceneError(Mistakes):
     Attributes:
         problems: a message for each mistake, which begins with the path of the entry if it concerns one.
         source: the name of the mechanism or of the file; empty if there is none.
+        is_placement: True if each number may be given, but the elements of a drawing cannot be placed with all of them.
     """
 
     subject = "scene"
+    is_placement = False
 
 
 class PlacementError(SceneError):
-    """An error for numbers of a drawing that may be given, each of them, but with which its elements cannot be placed."""
+    """An error for numbers with which the elements of a drawing cannot be placed."""
+
+    is_placement = True
 
 
 class SceneEntry(NamedTuple):

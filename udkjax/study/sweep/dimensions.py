@@ -19,7 +19,7 @@ from udkjax.scene.arguments import argument_problems
 from udkjax.scene.mechanism import Mechanism
 from udkjax.scene.numbers.number_fields import split_index
 from udkjax.scene.numbers.units import NUMBERS
-from udkjax.scene.tables.checks import Mistakes, PlacementError, SceneError
+from udkjax.scene.tables.checks import Mistakes, SceneError
 from udkjax.study.quantities import StudyModel
 from udkjax.study.sweep.axes import (
     NONE_LABELS,
@@ -223,9 +223,9 @@ def _misfits(mechanism: StudyModel, name: str, of: Sequence[str], numbers: np.nd
         for value in (numbers.min(axis=0), numbers.max(axis=0)):
             try:
                 mechanism.with_parameters(dict.fromkeys(parameters, value))
-            except PlacementError:
-                continue
             except SceneError as error:
+                if error.is_placement:
+                    continue
                 yield from (f"axis {quote(name)}: {problem}" for problem in error.problems)
                 return
     for target in of:
