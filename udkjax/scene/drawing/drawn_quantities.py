@@ -28,7 +28,7 @@ from udkjax.scene.numbers.quantities import (
 )
 from udkjax.scene.numbers.sources import AbstractDrawing
 from udkjax.scene.numbers.units import MOTION_LAW_FIELDS, field_unit
-from udkjax.scene.tables.schema import CLASSES_BY_TYPE, keys, table_of, type_name, with_samples
+from udkjax.scene.tables.schema import CLASSES_BY_TYPE, keys, table_of, type_name
 from udkjax.wording import abbreviate, quote, suggestion
 
 _KIND_OF = {unit: kind for kind, unit in QUANTITY_KINDS.items()}
@@ -278,7 +278,7 @@ class Units:
             if name not in expected:
                 converted[name] = value
                 continue
-            annotation, sampled_class = with_samples(expected[name].annotation)
+            annotation, sampled_class = expected[name].annotation, expected[name].sampled_class
             if sampled_class and isinstance(value, sampled_class | Mapping):
                 converted[name] = self._convert_samples(key_path, value, unit, problems)
                 continue

@@ -24,7 +24,7 @@ from udkjax.scene.elements.held import Held
 from udkjax.scene.elements.joints import Cam, Prismatic, Revolute, Slot
 from udkjax.scene.elements.profiles import AbstractProfile, LawProfile, profile_class
 from udkjax.scene.elements.rolling import Wheel
-from udkjax.scene.tables.schema import CLASSES_BY_TYPE, CLASSES_WITHOUT_TYPE, is_in_format, keys, table_of, with_samples
+from udkjax.scene.tables.schema import CLASSES_BY_TYPE, CLASSES_WITHOUT_TYPE, is_in_format, keys, table_of
 from udkjax.wording import LONGEST_QUOTE, abbreviate, quote, suggestion, unknown_key
 
 ListSizes = dict[str, tuple[int, str]]  # by named dimension: its length, and the name of the list that has it
@@ -200,7 +200,11 @@ def check_table(
             yield f"{where}.{_short(name)}: {unknown_key(name, expected)}"
     for name, key in expected.items():
         if name in table:
-            yield from _check_value(f"{where}.{name}", key.annotation, table[name], key.metadata, sizes, written.get(name))
+            path, value = f"{where}.{name}", table[name]
+            if key.sampled_class and isinstance(value, key.sampled_class | dict):
+                yield from _check_held(path, key.annotation.dim_str.split(), value)
+            else:
+                yield from _check_value(path, key.annotation, value, key.metadata, sizes, written.get(name))
             yield from _check_references(f"{where}.{name}", key.metadata.get("names"), table[name], known)
         elif key.required:
             yield f"{where}.{name}: missing"
@@ -222,10 +226,6 @@ def _check_value(
     `written` is the value as it was written, in another unit; None if this is the same.
     """
     value = value.value if isinstance(value, StaticValue) else value
-    annotation, sampled_class = with_samples(annotation)
-    if sampled_class and isinstance(value, sampled_class | dict):
-        yield from _check_held(path, annotation.dim_str.split(), value)
-        return
     if hasattr(annotation, "dim_str"):
         yield from _check_number(path, annotation.dim_str.split(), value, metadata, sizes, written)
     elif get_origin(annotation) is Literal:
@@ -302,7 +302,11 @@ def _check_number(
     is_fixed, shown = all(dim.isdigit() for dim in dims), value if written is None else written
     if array is not None and dims[-1:] == ["..."]:
         dims = [*dims[:-1], *map(str, array.shape[len(dims) - 1 :])]
-    if array is None or array.ndim != len(dims) or not _has_sizes(array, dims):
+    if (
+        array is None
+        or array.ndim != len(dims)
+        or not (array.shape == tuple(map(int, dims)) if is_fixed else _has_sizes(array, dims))
+    ):
         expected = f"{' x '.join(dims)} numbers" if is_fixed else "numbers"
         if not is_fixed and dims[-1].isdigit():
             expected = f"{'lists of ' * (len(dims) - 1)}{dims[-1]} numbers"

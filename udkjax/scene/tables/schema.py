@@ -65,9 +65,10 @@ class Key(NamedTuple):
     """One key of an element: a field of its class."""
 
     field: str  # the name of the key, followed by an underscore if it is a keyword of Python
-    annotation: Any  # a type or a union of types, without None
+    annotation: Any  # a type, without None; of a number that may be sampled, that of the plain number
     required: bool
     metadata: FieldMetadata
+    sampled_class: type | None  # the class of the samples of a number; None if it cannot be sampled
 
 
 @cache
@@ -76,22 +77,16 @@ def keys(cls: type) -> Mapping[str, Key]:
     keys_by_name = {}
     for field in dataclasses.fields(cls):
         if field.init:
-            annotation = field.type
-            if get_origin(annotation) in (Union, types.UnionType):
-                kinds = [kind for kind in get_args(annotation) if kind is not type(None)]
-                annotation = kinds[0] if len(kinds) == 1 else annotation
+            is_union = get_origin(field.type) in (Union, types.UnionType)
+            kinds = [kind for kind in get_args(field.type) if kind not in (type(None), Held)] if is_union else [field.type]
+            annotation, sampled_class = (
+                kinds[0] if len(kinds) == 1 else field.type,
+                Held if Held in get_args(field.type) else None,
+            )
             default = field.default is not dataclasses.MISSING or field.default_factory is not dataclasses.MISSING
-            key = field.name.removesuffix("_")
-            keys_by_name[key] = Key(field.name, annotation, not default, cast(FieldMetadata, field.metadata))
+            key, metadata = field.name.removesuffix("_"), cast(FieldMetadata, field.metadata)
+            keys_by_name[key] = Key(field.name, annotation, not default, metadata, sampled_class)
     return MappingProxyType(keys_by_name)
-
-
-def with_samples(annotation: Any) -> tuple[Any, type | None]:
-    """Return the annotation of a plain number, and the class of its samples; any annotation without samples, and None."""
-    if get_origin(annotation) is not types.UnionType:
-        return annotation, None
-    number, sampled_class = get_args(annotation)
-    return number, sampled_class
 
 
 def table_of(element: eqx.Module) -> dict[str, object]:
@@ -114,11 +109,10 @@ def build(annotation: Any, value: object) -> Any:
         return (
             str(value) if isinstance(value, np.str_) else value
         )  # NumPy's strings count as arrays, as when one is chosen at random
-    number, sampled_class = with_samples(annotation)
-    annotation = profile_class(value) if annotation is AbstractProfile else sampled_class or number
+    annotation = profile_class(value) if annotation is AbstractProfile else annotation
     cls = CLASSES_BY_TYPE["motion"][value["type"]] if "type" in value else annotation
-    expected = keys(cls)
-    return cls(**{expected[name].field: build(expected[name].annotation, item) for name, item in value.items() if name != "type"})
+    expected = {name: (keys(cls)[name], item) for name, item in value.items() if name != "type"}
+    return cls(**{key.field: build(key.sampled_class or key.annotation, item) for key, item in expected.values()})
 
 
 def numbers_in(element: eqx.Module) -> Iterator[tuple[tuple[str, ...], jax.Array | None, tuple[int, ...] | None]]:
