@@ -243,7 +243,8 @@ def by_jax(name):
 @pytest.mark.parametrize("width", [1, processor.lanes()])
 @pytest.mark.parametrize("name", CASES)
 def test_equals_jax(name, width):
-    for x, y in zip(lowered(*CASES[name], width), by_jax(name), strict=True):
+    function, given = CASES[name]
+    for x, y in zip(lowered(function, given, width), by_jax(name), strict=True):
         assert_allclose(x, np.asarray(y, float), rtol=1e-12, atol=1e-12)
 
 
