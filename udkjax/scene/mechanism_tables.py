@@ -13,12 +13,11 @@ from udkjax.annotations import TomlTable
 from udkjax.arrays import is_traced
 from udkjax.scene.elements.fields import vector_as_angle
 from udkjax.scene.mechanism import Mechanism
-from udkjax.scene.tables.checks import Mistakes, SceneEntry, SceneError, find_class, problems_of
+from udkjax.scene.tables.checks import LARGEST_INTEGER, Mistakes, SceneEntry, SceneError, find_class, problems_of
 from udkjax.scene.tables.element_setup import name_elements
 from udkjax.scene.tables.schema import CLASSES_BY_TYPE, CLASSES_WITHOUT_TYPE, SECTIONS, build, is_in_format, table_of, type_name
 from udkjax.wording import abbreviate, unknown_key
 
-LARGEST_INTEGER = 2**1023  # of a file; larger ones are beyond the range of floats
 FORMAT_VERSION = 1  # version of the format of scenes with bodies and joints
 
 
@@ -175,8 +174,9 @@ def _without_huge_integers(value: Any) -> Any:
         return {key: _without_huge_integers(x) for key, x in value.items()}
     if isinstance(value, list):
         return [_without_huge_integers(x) for x in value]
-    is_huge = isinstance(value, int) and abs(value) > LARGEST_INTEGER
-    return math.copysign(math.inf, value > 0 or -1) if is_huge else value
+    if isinstance(value, int) and abs(value) > LARGEST_INTEGER:
+        return math.inf if value > 0 else -math.inf
+    return value
 
 
 def is_xml(text: str) -> bool:

@@ -118,14 +118,14 @@ def read_drawing(
     layout = PinLayout(groups["link"], fixed_pins, groups["slide"])
     all_read = all(len(groups[section]) == len(named[section]) for section in groups)
     problems += layout_mistakes(layout, groups, fixed_pins, all_read)
-    count = len(problems)
+    had_mistakes = bool(problems)
     if not is_traced((groups["pin"], groups["link"])):
         drawn = concrete_elements(groups)
         problems += shape_mistakes(drawn["pin"], drawn["link"], {slot.pin for slot in drawn["slot"].values()})
         if not problems and not is_traced([groups[section] for section in ("slide", "slot", "gear", "cam")]):
             with jax.ensure_compile_time_eval():  # concrete even while something else is traced
                 problems += gap_mistakes(placement_of(drawn, fixed_pins), drawn)
-    return DrawingElements(groups, gravity, problems, tuple(formulas), not count and len(problems) > 0)
+    return DrawingElements(groups, gravity, problems, tuple(formulas), bool(problems) and not had_mistakes)
 
 
 def _read_element(

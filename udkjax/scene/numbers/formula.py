@@ -17,7 +17,6 @@ LONGEST_TEXT = 500  # characters of an expression
 _DEEP_NESTING = re.compile(r"[-+(]{50}")  # so many signs and brackets in a row are no expression that one would write
 CONSTANTS = {"pi": math.pi}
 FUNCTIONS = {"sqrt": 1, "abs": 1, "sin": 1, "cos": 1, "tan": 1, "asin": 1, "acos": 1, "atan": 1, "atan2": 2, "hypot": 2}
-_ANGLE_FUNCTIONS = ("asin", "acos", "atan", "atan2")  # functions that return angles
 _NUMPY_NAMES = {"asin": "arcsin", "acos": "arccos", "atan": "arctan", "atan2": "arctan2"}
 _SYNTAX = "write numbers and names with + - * / **, ( ), and " + ", ".join(FUNCTIONS)
 
@@ -201,7 +200,7 @@ class _Evaluation:
         """Return the product of a value and another one to the power 1 or -1."""
         (x, unit), (y, other) = first, second
         if other == "" or (unit == "" and power == 1) or (unit == other and power == -1):
-            return Measured(x * y if power == 1 else x / y, unit or other if unit != other or power == 1 else "")
+            return Measured(x * y if power == 1 else x / y, "" if unit == other else unit or other)
         x, y = self._si(first), self._si(second)
         pairs = zip(dimension_of(unit or "1"), dimension_of(other), strict=True)
         return self._measured(x * y if power == 1 else x / y, unit_of(tuple(a + power * b for a, b in pairs)))
@@ -226,12 +225,12 @@ class _Evaluation:
             if units[0] not in ("", "rad"):
                 raise ValueError(f"{name} needs an angle, not a quantity in {units[0]}")
             return Measured(function(values[0] * angle), "")
-        if name in ("asin", "acos", "atan") and units[0]:
-            raise ValueError(f"{name} needs a plain number, such as a ratio, not a quantity in {units[0]}")
         if name in ("atan2", "hypot"):
             values, unit = self._alike(f"{name} of", *given)
             return Measured(function(*values), unit) if name == "hypot" else Measured(function(*values) / angle, "rad")
-        if name in _ANGLE_FUNCTIONS:
+        if name in ("asin", "acos", "atan"):
+            if units[0]:
+                raise ValueError(f"{name} needs a plain number, such as a ratio, not a quantity in {units[0]}")
             return Measured(function(*values) / angle, "rad")
         if name == "sqrt" and units[0]:
             return self._power(given[0], ast.Constant(0.5))

@@ -27,6 +27,7 @@ from udkjax.scene.elements.rolling import Wheel
 from udkjax.scene.tables.schema import CLASSES_BY_TYPE, CLASSES_WITHOUT_TYPE, is_in_format, keys, table_of
 from udkjax.wording import LONGEST_QUOTE, abbreviate, quote, suggestion, unknown_key
 
+LARGEST_INTEGER = 2**1023  # larger ones are beyond the range of floats
 ListSizes = dict[str, tuple[int, str]]  # by named dimension: its length, and the name of the list that has it
 KnownNames = Mapping[str, Mapping[str, type | None]]  # the classes of elements, by kind (body, revolute) and by name
 
@@ -358,7 +359,7 @@ def _as_array(value: object) -> np.ndarray | None:
         ragged = any(item is None for item in items) or len({item.shape for item in items if item is not None}) > 1
         return None if ragged else np.array(items, dtype=float)
     if isinstance(value, int | float) and not isinstance(value, bool):
-        return np.array(float(value) if isinstance(value, float) or abs(value) < 2**1023 else np.inf)
+        return np.array(float(value) if isinstance(value, float) or abs(value) <= LARGEST_INTEGER else np.inf)
     return None
 
 
